@@ -26,6 +26,7 @@ from oodd_eval.metrics.auc import AlarmRule, Contribution
 from oodd_eval.metrics.catalogue import GUARANTEED, RANKING
 from oodd_eval.metrics.curves import Sweep, cell_curves, thresholds
 from oodd_eval.metrics.cusum import Standardization
+from oodd_eval.results.compare import write_reference
 from oodd_eval.results.curve_file import write_curves
 from oodd_eval.results.evaluate import metric_of
 from oodd_eval.results.strengths import DETECTION
@@ -75,18 +76,17 @@ GRADED_ROWS = {"riqn": (0, 0.5), "rf": (0.5, 1), "clock": (0, 0)}
 """Share of episodes that a row finds at the weakest and at the strongest rung of a ladder."""
 
 
-def graded(root):
-    """The suites of a leaderboard in `root` with three rows on one ladder."""
+def graded(root, rows=GRADED_ROWS, keep=(DETECTION, RANKING)):
+    """The suites of a leaderboard in `root` with rows on one ladder, with some of their metrics."""
     names = list(rungs_of("cartpole", "iid"))
-    lines = []
-    for row, (first, last) in GRADED_ROWS.items():
+    records = []
+    for row, (first, last) in rows.items():
         for name, share in zip(names, np.linspace(first, last, len(names)), strict=True):
             values = {DETECTION: [float(i < 8 * share) for i in range(8)], RANKING: [0.5] * 8}
-            fields = {"strength": name, "values": values}
-            lines.append(make_record(row, "cartpole", "iid", **fields).to_json() + "\n")
+            records.append(make_record(row, "cartpole", "iid", strength=name, values=values))
     own = root / "suites" / "small"
     own.mkdir(parents=True)
-    (own / "records.jsonl").write_text("".join(lines), encoding="utf-8")
+    write_reference(records, own / "records.jsonl", keep=keep)
     return suite_sections(root)
 
 

@@ -14,6 +14,7 @@ from oodd_eval.leaderboard.entry import read_entries, sections
 from oodd_eval.leaderboard.site.data import site_data
 from oodd_eval.metrics.catalogue import METRICS
 from oodd_eval.results.curve_file import read_curves
+from oodd_eval.results.strengths import DETECTION
 from oodd_eval.results.tables import show_value
 
 pytestmark = [
@@ -583,6 +584,20 @@ def test_rows_of_the_power_curves_can_be_left_out(browser):
     browser.run("document.querySelector('[name=power-row][value=rf]').click()")
     assert browser.texts("#power .legend li") == ["riqn", "trivial rows"]
     assert browser.run("return document.activeElement.value") == "rf"
+
+
+def test_of_many_power_curves_the_first_are_drawn_and_a_measure_may_be_missing(
+    window, entries, tmp_path
+):
+    rows = {f"row-{i}": (0, 1 - i / 20) for i in range(10)} | {"riqn": (0, 0.2), "clock": (0, 0)}
+    suites = helpers_site.graded(tmp_path, rows, [DETECTION])
+    window.open(written(entries, tmp_path, suites) + "#/power")
+    window.wait_for("document.querySelector('#power') !== null")
+    drawn = [*(f"row-{i}" for i in range(8)), "riqn", "trivial rows"]
+    assert window.texts("#power .legend li") == drawn
+    window.run("document.querySelectorAll('[name=power-metric]')[1].click()")
+    assert window.text("#power .note") == "The records of split mini do not have this measure."
+    assert window.texts("#power table caption")
 
 
 # -- overviews, pairs, the player -----------------------------------------------------------------

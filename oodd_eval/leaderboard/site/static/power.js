@@ -1,6 +1,7 @@
 // Detection power: what rows find of weaker anomalies, drawn over the strength or over its cost.
 
-const power = { metric: 0, axis: "strength", hidden: new Set() };
+const power = { metric: 0, axis: "strength", hidden: null };
+const POWER_SHOWN = 8; // rows of a split that are drawn at first, as many as there are colours
 
 const POWER_AXES = {
   strength: { title: "strength", place: 0, bend: Math.log10 },
@@ -12,6 +13,10 @@ function powerPage() {
   const metrics = DATA.power[0].metrics.map((metric, i) => [i, metric.title]);
   const axes = Object.entries(POWER_AXES).map(([name, axis]) => [name, `over ${axis.title}`]);
   const labels = [...new Set(DATA.power.flatMap((suite) => suite.rows.filter((row) => !row.trivial).map((row) => row.label)))];
+  if (!power.hidden) {
+    const first = DATA.power.flatMap((suite) => suite.rows.filter((row) => !row.trivial).slice(0, POWER_SHOWN).map((row) => row.label));
+    power.hidden = new Set(labels.filter((label) => ![...first, "riqn"].includes(label)));
+  }
   const again = () => document.getElementById("detector").replaceChildren(...powerPage());
   const set = (name) => (value) => { power[name] = value; again(); };
   return [
@@ -38,8 +43,12 @@ function powerOf(suite) {
   const costs = suite.rows.some((row) => row.points.some((points) => points.some((p) => isNumber(p[POWER_AXES.lost.place]))));
   const axis = costs ? POWER_AXES[power.axis] : POWER_AXES.strength;
   const metric = suite.metrics[power.metric];
-  const drawn = suite.rows.filter((row) => !power.hidden.has(row.label)).map((row) => ({ ...row, points: row.points[power.metric].filter((p) => isNumber(p[axis.place])) }));
-  if (!drawn.length) return [element("p", { class: "note" }, "No row is chosen."), suite.tables.map(powerTable)].flat();
+  const chosen = suite.rows.filter((row) => !power.hidden.has(row.label)).map((row) => ({ ...row, points: row.points[power.metric].filter((p) => isNumber(p[axis.place])) }));
+  const drawn = chosen.filter((row) => row.points.length);
+  if (!drawn.length) {
+    const reason = chosen.length ? `The records of split ${suite.split} do not have this measure.` : "No row is chosen.";
+    return [element("p", { class: "note" }, reason), suite.tables.map(powerTable)].flat();
+  }
   const xs = drawn.flatMap((row) => row.points.map((p) => p[axis.place]));
   const x = axis.bend
     ? { range: [Math.min(...xs) / 1.2, Math.max(...xs) * 1.2], ticks: [0.001, 0.01, 0.1, 1, 10, 100, 1000], label: suite.unit ? `strength (1: ${suite.unit})` : "strength", bend: axis.bend }
