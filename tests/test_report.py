@@ -92,11 +92,13 @@ def test_markdown_has_every_table_with_its_columns_and_numbers():
 
 
 def test_a_reference_with_chosen_metrics_has_no_tables_of_dashes(tmp_path):
-    """Without any metric, the tables say that all failed."""
+    """Tables with undefined values say why, and without any metric that all failed."""
     kept = tmp_path / "records.jsonl"
     write_reference([r for r in example() if r.ok], kept, keep=["found_within_20_at_5pct"])
     titles = markdown_tables(rendered(ResultsDirectory(tmp_path).records()))
     assert [*titles] == ["Guaranteed alarms at 5 % (%)"]
+    undefined = [make_record("x", values={"auc_matched": [None, None]})]
+    assert "Undefined for x: " in rendered(undefined)
     failed = [make_record("x", status="error", reason="none")]
     assert any(title.startswith("Separability") for title in markdown_tables(rendered(failed)))
 

@@ -140,6 +140,10 @@ class Board:
         metrics = {name for record in self.records for name in record.metrics}
         return [name for name in names if name in metrics]
 
+    def leaves_out(self, names: Iterable[str]) -> bool:
+        """Tell whether records have metrics, but none of these, as in a suite that keeps others."""
+        return any(record.metrics for record in self.records) and not self.present(names)
+
     def mean(
         self,
         entry: Setting,

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any, Final, Literal
 
-from oodd_eval.metrics.catalogue import HEADLINE, LEVELS, NAMES, UNDEFINED, metric_info
+from oodd_eval.metrics.catalogue import HEADLINE, LEVELS, METRICS, NAMES, UNDEFINED, metric_info
 from oodd_eval.names import counted
 from oodd_eval.results import strengths, tables
 from oodd_eval.results.board import Board, boards, grouped
@@ -20,6 +20,9 @@ from oodd_eval.results.tables import Table
 from oodd_eval.results.unpaired import UnpairedTables, phase_findings
 
 Detail = Literal["brief", "wide", "full"]
+
+_OF_PAPER: Final = [name for name, info in METRICS.items() if info.paper]
+_WITHOUT_ALARM: Final = [n for n, info in METRICS.items() if not (info.request or info.paper)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,21 +108,21 @@ class Report:
     def _of_board(self, board: Board) -> Section:
         ok = sum(r.ok for r in board.records)
         counts = f"{len(board.records)}, of which {ok} ok and {len(board.records) - ok} failed"
-        # Stored records have chosen metrics: tables of others would have dashes alone.
-        stored = any(record.metrics for record in board.records)
         return Section(
             f"Split {board.split}",
             [f"Cells: {counts}."],
             findings_of(board, self.level),
-            [t for t in self._tables(board) if t and not (stored and t.blank)],
+            [table for table in self._tables(board) if table],
             notes=tables.notes(board),
             verdict=verdict_of(board, self.level),
         )
 
     def _tables(self, board: Board) -> Iterator[Table | None]:
         intervals, full = self.intervals, self.detail == "full"
+        ranked = not board.leaves_out([board.ranking])
         if board.paired:
-            yield tables.separability(board, intervals=intervals)
+            if ranked:
+                yield tables.separability(board, intervals=intervals)
             yield tables.guaranteed(board, self.level, intervals=intervals)
         else:
             of_board = UnpairedTables(board, intervals, level=self.level)
@@ -129,13 +132,16 @@ class Report:
             board, intervals=intervals, places=full, units=self.units
         )
         if self.detail != "brief":
-            yield tables.all_metrics(board, intervals=intervals)
+            if not board.leaves_out(_WITHOUT_ALARM):
+                yield tables.all_metrics(board, intervals=intervals)
             yield from tables.all_alarms(board, intervals=intervals)
         if board.paired and (full or self.paper):
-            yield tables.papers(board, intervals=intervals)
+            if not board.leaves_out(_OF_PAPER):
+                yield tables.papers(board, intervals=intervals)
             yield from tables.anomaly_groups(board, intervals=intervals)
         if full:
-            if len(board.environments) * len(board.anomalies) > 1:  # one figure stands above
+            # One figure stands above.
+            if ranked and len(board.environments) * len(board.anomalies) > 1:
                 yield from (tables.by_anomaly(board, e, intervals=intervals) for e in board.entries)
             yield tables.failures(board)
 

@@ -295,8 +295,8 @@ def strength_tables(
     if not board.paired:  # episodes of two strengths have nothing in common
         return [_separability(board, board.entries, strengths)] if strengths.names else []
     order = [entry for entry in board.entries if entry in by_row]
-    ranking = by_row and board.present([board.ranking])
-    separability = [_separability(board, order, strengths)] if ranking else []
+    ranked = by_row and not board.leaves_out([board.ranking])
+    separability = [_separability(board, order, strengths)] if ranked else []
     if not any(by_row.values()):  # no level of 5 %, with few calibration episodes
         return separability
     by_kind = _by_kind(board, by_row, strengths, intervals=intervals, units=units)

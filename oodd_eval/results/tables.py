@@ -44,11 +44,6 @@ class Table:
         """``"left"`` or ``"right"`` for every column, as tabulate takes it."""
         return tuple("left" if i < self.labels else "right" for i in range(len(self.header)))
 
-    @property
-    def blank(self) -> bool:
-        """Whether the rows have nothing but their names."""
-        return all(cell.strip("*") in ("", UNDEFINED) for row in self.rows for cell in row[1:])
-
     def columns(self, indices: Sequence[int]) -> "Table":
         """Return the table with these columns only."""
         rows = [[row[i] for i in indices] for row in self.rows]
