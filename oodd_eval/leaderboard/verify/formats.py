@@ -111,9 +111,6 @@ _COST: Final = Rule(
     f"a number from 0 to {MOST_COST:g}, or null",
 )
 
-# Entries of protocol 2 stay on boards of their own until those splits are computed anew.
-PROTOCOLS: Final = (2, PROTOCOL)
-
 _ENTRY: Final[Mapping[str, Rule]] = {
     "schema": _one_of(SCHEMA),
     "id": ENTRY_ID,
@@ -126,7 +123,7 @@ _ENTRY: Final[Mapping[str, Rule]] = {
     ),
     "split": _NAME,
     "split_digest": _DIGEST,
-    "protocol": _one_of(*PROTOCOLS),
+    "protocol": _one_of(PROTOCOL),
     "created": Rule(_is_day, "a date such as 2026-11-21, from 2020 to 2099"),
     "environment": Rule(
         lambda value: (
@@ -143,7 +140,7 @@ _ENTRY: Final[Mapping[str, Rule]] = {
 }
 _RECORD: Final[Mapping[str, Rule]] = {
     "schema": _one_of(record_format.SCHEMA),
-    "protocol": _one_of(*PROTOCOLS),
+    "protocol": _one_of(PROTOCOL),
     "detector": _NAME,
     "detector_version": _NAME,
     "plugin": PLUGIN_NAME,
