@@ -234,9 +234,16 @@ def test_a_page_has_every_table_of_every_board_and_the_entries():
     assert all(f"### {e.meta.id}: An entry" in text for e in entries())
 
 
-def test_a_board_says_who_ran_what():
-    first, second = page(sections(entries())).split("\n## Split mini")[1:]
-    ran = "Run by Somebody (4 detectors). Re-run by us: clock, persistence."
+@pytest.mark.parametrize(
+    ("places", "where"), [(["hopper"], " in Hopper alone"), (["ant", "hopper"], ""), ([], "")]
+)
+def test_a_board_says_who_ran_what(places, where):
+    reference, trivial, other = entries()
+    grant = dataclasses.replace(trivial.grant, environments=places)
+    trivial = dataclasses.replace(trivial, grant=grant)
+    of_boards = sections([reference, trivial, other])
+    first, second = page(of_boards).split("\n## Split mini")[1:]
+    ran = f"Run by Somebody (4 detectors). Re-run by us{where}: clock, persistence."
     assert f"\n{ran} Nobody has run or scored the others again.\n" in first
     assert "\nRun by Somebody (2 detectors). Nobody has run or scored them again.\n" in second
 

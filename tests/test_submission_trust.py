@@ -131,6 +131,7 @@ def test_fresh_seeds_confirm_within_what_chance_explains(entry, tmp_path, fresh)
     granted = read_entry(draft.path).grant
     assert (granted.trust, granted.by) == ("re-run", "M. Aintainer")
     assert granted.how.endswith("24 of 24 cells")
+    assert sorted(granted.environments) == sorted(THREE)
     entry, again = (
         np.mean([r.value("auc_matched") for r in records])
         for records in (read_entry(draft.path).records, fresh)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from oodd_eval._version import repository
-from oodd_eval.data.facts import SPLITS
+from oodd_eval.data.facts import SPLITS, title_of
 from oodd_eval.data.files import PACKED, compress, decompress, write_bytes, write_text
 from oodd_eval.data.split import published_digests
 from oodd_eval.errors import ResultsError
@@ -242,11 +242,14 @@ def _who_ran(entries: Sequence[SubmittedEntry]) -> str:
     """Return who ran the detectors of a board, and which of them somebody ran or scored again."""
     ran: dict[str, set[str]] = {}
     again: dict[tuple[str, str], set[str]] = {}
+    everywhere = {record.environment for entry in entries for record in entry.records}
     for entry in entries:
         ran.setdefault(entry.meta.submitter or "nobody named", set()).update(entry.meta.detectors)
-        if entry.grant:
-            of = again.setdefault((entry.grant.trust, entry.grant.by), set())
-            of.update(entry.grant.means or entry.meta.detectors)
+        if grant := entry.grant:
+            places = grant.environments if set(grant.environments) != everywhere else []
+            where = f" in {', '.join(map(title_of, places))} alone" if places else ""
+            of = again.setdefault((grant.trust, f"{grant.by}{where}"), set())
+            of.update(grant.means or entry.meta.detectors)
     rows = [f"{who} ({counted(len(names), 'detector(s)')})" for who, names in sorted(ran.items())]
     parts = [f"Run by {', '.join(rows)}."]
     for (trust, who), names in sorted(again.items()):

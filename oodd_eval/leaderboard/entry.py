@@ -105,7 +105,8 @@ class Grant:
     """A level of trust above ``"reported"``, of the entry whose ``entry.json`` has a digest.
 
     `by` is who granted it, `day` when (ISO 8601), and `how` what was compared with what. `means`
-    are over the cells that a re-run has, by row and metric: the entry's, and the re-run's.
+    are over the cells that a re-run has, by row and metric: the entry's, and the re-run's. They
+    are of these `environments`.
     """
 
     entry: str
@@ -114,6 +115,7 @@ class Grant:
     day: Printable
     how: Printable
     means: Means = field(default_factory=dict)
+    environments: list[str] = field(default_factory=list)
 
     __pydantic_config__: ClassVar = {"extra": "forbid", "strict": True}
 

@@ -25,7 +25,6 @@ from oodd_eval.leaderboard.entry import (
     TRUST,
     EntryInfo,
     Grant,
-    Means,
     SubmittedEntry,
     Trust,
     digest_of,
@@ -311,11 +310,11 @@ def grant(directory: Path, verdict: EntryVerdict, by: str) -> Grant:
             f"--grant: {verdict.name} has trust {verdict.trust!r}, and what was established here "
             f"is {level!r}: more needs its scores (re-scored) or leaderboard rerun of all its rows"
         )
-    how, means = "every metric recomputed from its scores", Means()
-    if verdict.rerun:
-        how, means = verdict.rerun.how, verdict.rerun.means
     day = datetime.now(UTC).date().isoformat()
-    new = Grant(verdict.digest, level, by, day, how, means)
+    if again := verdict.rerun:
+        new = Grant(verdict.digest, level, by, day, again.how, again.means, again.environments)
+    else:
+        new = Grant(verdict.digest, level, by, day, "every metric recomputed from its scores")
     results = directory.absolute().parent
     write_grants(results, read_grants(results) | {verdict.name: new})
     return new

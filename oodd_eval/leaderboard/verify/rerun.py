@@ -148,6 +148,12 @@ class Rerun:
             for row, compared in self.differences.items()
         }
 
+    @property
+    def environments(self) -> list[str]:
+        """Those in which a row was compared, in order."""
+        compared = (d.environment for of_row in self.differences.values() for d in of_row)
+        return [*dict.fromkeys(name for name in compared if name)]
+
 
 def cell_of(record: Record) -> tuple[Setting, str, str, int]:
     """Return row, environment, condition and detector seed of a record."""
