@@ -108,16 +108,16 @@ class Report:
     def _of_board(self, board: Board) -> Section:
         ok = sum(r.ok for r in board.records)
         counts = f"{len(board.records)}, of which {ok} ok and {len(board.records) - ok} failed"
-        shown: list[Table] = []
+        distinct: list[Table] = []
         # Of records with few metrics the table of a level has what the overview has.
         for table in self._tables(board):
-            if table and table not in shown:
-                shown.append(table)
+            if table and table not in distinct:
+                distinct.append(table)
         return Section(
             f"Split {board.split}",
             [f"Cells: {counts}."],
             findings_of(board, self.level),
-            shown,
+            distinct,
             notes=tables.notes(board),
             verdict=verdict_of(board, self.level),
         )
