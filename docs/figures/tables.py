@@ -168,12 +168,10 @@ def of_protocols(name: str) -> str:
 
 @functools.cache
 def run_again() -> dict[str, dict[str, list[float]]]:
-    """Return means over the cells that were run again, on the board and there, by row and metric.
-
-    Rows of several grants have those of the last one.
-    """
-    grants = json.loads((BOARD / "trust.json").read_text(encoding="utf-8"))["grants"].values()
-    return {row: means for grant in grants for row, means in grant["means"].items()}
+    """Return means of an entry on `standard` and of its re-run by row and metric."""
+    grants = json.loads((BOARD / "trust.json").read_text(encoding="utf-8"))["grants"]
+    means = [grant["means"] for entry, grant in grants.items() if entry.endswith("-standard")]
+    return dict(row for of_entry in means for row in of_entry.items())
 
 
 def of_rerun(name: str) -> str:

@@ -109,7 +109,7 @@ class Report:
         ok = sum(r.ok for r in board.records)
         counts = f"{len(board.records)}, of which {ok} ok and {len(board.records) - ok} failed"
         distinct: list[Table] = []
-        # Of records with few metrics the table of a level has what the overview has.
+        # Where records keep few metrics, the overview and a level's table are the same.
         for table in self._tables(board):
             if table and table not in distinct:
                 distinct.append(table)
