@@ -70,13 +70,15 @@ from oodd_recording.commands import record_split
     help="entries of one split; several are run on the same fresh seeds",
 )
 @click.option("--detector", default="all", type=Names("detectors"), help=NAMES)
-@click.option("--env", default="all", type=Names("envs"), help=NAMES)
+@click.option(
+    "--env", type=Names("envs"), help=f"{NAMES} (default: those of the re-run so far, at first all)"
+)
 @click.option("--seed", type=SEEDS, help="seeds of the detectors (default: those of the entry)")
 @click.option(
     "--output",
     type=DIRECTORY,
     help="directory of the re-run (default: rerun-ENTRY, of one entry); the same command goes on "
-    "where it was interrupted, and other detectors are added",
+    "where it was interrupted, and other detectors and environments are added",
 )
 @click.option("--grant", help="once all rows agree, grant one entry the level re-run in this name")
 @jobs_option
@@ -93,9 +95,9 @@ def rerun(options: Options) -> int:
             "one with the same --output and --grant"
         )
     verdicts, console = sound(options.paths), make_console()
-    records = chosen(verdicts, options)
-    environments = in_order((record.environment for record in records), ENVIRONMENTS)
     results = ResultsDirectory(options.output or Path(f"rerun-{verdicts[0].name}"))
+    records = chosen(verdicts, options, read_order(results.path))
+    environments = in_order((record.environment for record in records), ENVIRONMENTS)
     if missing := unfinished(records, results):
         require_sandbox()
         limits = Limits(options.timeout, options.memory, (str(results.path.absolute()),))
@@ -153,11 +155,14 @@ def definition_of(verdict: EntryVerdict, bits: int = 0) -> SplitDefinition:
     return replace(definition, name=f"rerun-{drawn[:12]}", seed_base=0, drawn=drawn)
 
 
-def chosen(verdicts: Sequence[EntryVerdict], options: Options) -> list[Record]:
-    """Return the records of entries that the options choose."""
+def chosen(
+    verdicts: Sequence[EntryVerdict], options: Options, order: RerunOrder | None
+) -> list[Record]:
+    """Return the records of entries that the options choose, an order's environments by default."""
     records = [record for verdict in verdicts for record in verdict.records.values()]
     environments = in_order((record.environment for record in records), ENVIRONMENTS)
-    environments = select("environment", options.env, environments)
+    earlier_ones = ",".join(order.environments) if order else "all"
+    environments = select("environment", options.env or earlier_ones, environments)
     detectors = select("detector", options.detector, {record.detector for record in records})
     known = sorted({record.seed for record in records})
     if not set(options.seed or known) <= set(known):
@@ -213,16 +218,15 @@ def draw(
 ) -> RerunOrder:
     """Draw bits for entries and write the order, or go on with one that is there for them.
 
-    `UsageError`: the order there is for other entries, other versions of them, or lacks an
-    environment.
+    Environments that it lacks are added: entries are fixed by digest, and seeds by the bits, so
+    that it does not matter when an environment is named.
+    `UsageError`: the order there is for other entries, or other versions of them.
     """
     order = read_order(directory)
     if order is None:
         day = datetime.now(UTC).date().isoformat()
         digests = [verdict.digest for verdict in verdicts]
-        order = RerunOrder(digests, secrets.token_hex(16), day, list(environments))
-        directory.mkdir(parents=True, exist_ok=True)
-        write_text(directory / ORDER, json.dumps(asdict(order), indent=1, sort_keys=True) + "\n")
+        order = RerunOrder(digests, secrets.token_hex(16), day, [])
     for verdict in verdicts:
         if verdict.digest not in order.entries:
             drawn_for = ", ".join(digest[:12] for digest in order.entries)
@@ -232,10 +236,10 @@ def draw(
                 "another --output"
             )
     if not set(environments) <= set(order.environments):
-        raise UsageError(
-            f"{str(directory)!r} is a re-run on {', '.join(order.environments)}, expected "
-            f"{', '.join(environments)}: name another --output"
-        )
+        every = in_order([*order.environments, *environments], ENVIRONMENTS)
+        order = replace(order, environments=every)
+        directory.mkdir(parents=True, exist_ok=True)
+        write_text(directory / ORDER, json.dumps(asdict(order), indent=1, sort_keys=True) + "\n")
     return order
 
 

@@ -99,6 +99,16 @@ class EntryVerdict:
             return "re-run"
         return "re-scored" if self.rescored else "reported"
 
+    @property
+    def gains(self) -> bool:
+        """True where a higher level was established, or a re-run in more environments."""
+        if self.reached is None:
+            return False
+        places = self.rerun.environments if self.rerun and self.reached == "re-run" else ()
+        held = self.grant.environments if self.grant else ()
+        reached = TRUST.index(self.reached), len(places)
+        return reached > (TRUST.index(self.trust), len(held))
+
 
 def verify_entry(
     directory: Path, *, name: str = "", split: str | Path | None = None
@@ -221,7 +231,7 @@ def _notes_on_trust(verdict: EntryVerdict) -> Iterator[str]:
     """Say who granted the level of trust that an entry has, and which one was established here."""
     if (held := verdict.grant) is not None:
         yield f"{held.trust} was granted by {held.by} on {held.day}: {held.how}"
-    if verdict.reached is not None and TRUST.index(verdict.reached) > TRUST.index(verdict.trust):
+    if verdict.gains:
         yield f"qualifies for {verdict.reached!r} (--grant)"
 
 
@@ -305,10 +315,11 @@ def grant(directory: Path, verdict: EntryVerdict, by: str) -> Grant:
     level = verdict.reached
     if level is None:
         raise UsageError(f"--grant: {verdict.name} is refused, so nothing is granted")
-    if level == "reported" or TRUST.index(level) <= TRUST.index(verdict.trust):
+    if not verdict.gains:
         raise UsageError(
             f"--grant: {verdict.name} has trust {verdict.trust!r}, and what was established here "
-            f"is {level!r}: more needs its scores (re-scored) or leaderboard rerun of all its rows"
+            f"is {level!r}: more needs its scores (re-scored) or leaderboard rerun of all its rows "
+            "(in more environments than before)"
         )
     day = datetime.now(UTC).date().isoformat()
     if again := verdict.rerun:
