@@ -114,10 +114,10 @@ def test_who_grants_is_plain_text(submissions, tmp_path, name, capsys):
 # re-run
 
 
-def compared(draft, fresh, **changes):
+def compared(draft, fresh, environments=THREE):
     """The verdict on an entry with a re-run of these records, under an order of seeds."""
     verdict = verify_entry(draft.path)
-    order = RerunOrder([verdict.digest], "0" * 32, "2026-11-26", list(THREE), **changes)
+    order = RerunOrder([verdict.digest], "0" * 32, "2026-11-26", list(environments))
     again = compare_rerun(verdict.records, fresh, order, verdict.findings)
     return dataclasses.replace(verdict, rerun=again)
 
@@ -246,6 +246,19 @@ def test_a_grant_needs_every_cell_of_every_row(entry, tmp_path, fresh):
         assert verdict.reached == "reported"
         with pytest.raises(UsageError, match="leaderboard rerun of all its rows"):
             grant(draft.path, verdict, "me")
+
+
+def test_a_grant_of_more_environments_replaces_one_of_fewer(entry, tmp_path, fresh):
+    draft = of_three(entry, tmp_path)
+    two = [r for r in fresh if r.environment != "hopper"]
+    for records, environments in ((two, THREE[:2]), (fresh, THREE)):
+        verdict = compared(draft, records, environments)
+        grant(draft.path, verdict, "me")
+        assert sorted(read_entry(draft.path).grant.environments) == sorted(environments)
+        with pytest.raises(UsageError, match="in more environments than before"):
+            grant(draft.path, compared(draft, records, environments), "me")
+    with pytest.raises(UsageError, match="in more environments than before"):
+        grant(draft.path, compared(draft, two, THREE[:2]), "me")
 
 
 def test_where_it_was_computed_makes_no_other_detector(entry, tmp_path, fresh):

@@ -315,7 +315,7 @@ def grant(directory: Path, verdict: EntryVerdict, by: str) -> Grant:
     level = verdict.reached
     if level is None:
         raise UsageError(f"--grant: {verdict.name} is refused, so nothing is granted")
-    if not verdict.gains:
+    if level == "reported" or not verdict.gains:
         raise UsageError(
             f"--grant: {verdict.name} has trust {verdict.trust!r}, and what was established here "
             f"is {level!r}: more needs its scores (re-scored) or leaderboard rerun of all its rows "
