@@ -5,7 +5,7 @@ import fnmatch
 import json
 import operator
 import re
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Sequence
 from typing import Any, Final, TypeVar
 
 from oodd_eval.errors import UnknownNameError, UsageError
@@ -43,6 +43,17 @@ def counted(n: int, noun: str) -> str:
     """
     singular, plural = (r"\1", "") if n == 1 else (r"\2", "s")
     return f"{n} " + re.sub(r"\((\w+)/(\w+)\)", singular, noun).replace("(s)", plural)
+
+
+def listed(names: Sequence[str], most: int = 4) -> str:
+    """Return names in a sentence, of many the first ones and how many more there are.
+
+    >>> listed(["Acrobot"]), listed(["Acrobot", "CartPole"]), listed(list("abcde"))
+    ('Acrobot', 'Acrobot and CartPole', 'a, b, c and 2 more')
+    """
+    if len(names) > most:
+        return f"{', '.join(names[: most - 1])} and {len(names) - most + 1} more"
+    return " and ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))
 
 
 def select(kind: str, patterns: str, known: Iterable[str]) -> list[str]:

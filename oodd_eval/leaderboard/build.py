@@ -24,7 +24,7 @@ from oodd_eval.leaderboard.entry import (
     sections,
 )
 from oodd_eval.leaderboard.published import PUBLISHED, published_bytes
-from oodd_eval.names import counted
+from oodd_eval.names import counted, listed
 from oodd_eval.results import tables
 from oodd_eval.results.board import Board
 from oodd_eval.results.record import Record
@@ -247,7 +247,7 @@ def _who_ran(entries: Sequence[SubmittedEntry]) -> str:
         ran.setdefault(entry.meta.submitter or "nobody named", set()).update(entry.meta.detectors)
         if grant := entry.grant:
             places = grant.environments if set(grant.environments) != everywhere else []
-            where = f" in {', '.join(map(title_of, places))} alone" if places else ""
+            where = f" in {listed([*map(title_of, places)], 7)} alone" if places else ""
             of = again.setdefault((grant.trust, f"{grant.by}{where}"), set())
             of.update(grant.means or entry.meta.detectors)
     rows = [f"{who} ({counted(len(names), 'detector(s)')})" for who, names in sorted(ran.items())]

@@ -29,9 +29,10 @@ from oodd_eval.data.inspection.meaning import (
     usable_files,
     window_of,
 )
-from oodd_eval.data.inspection.report import listed, number, toml
+from oodd_eval.data.inspection.report import number, toml
 from oodd_eval.data.logs import NO_OPTIONS, Options
 from oodd_eval.data.recipe import MISSING_ROWS, Recipe
+from oodd_eval.names import listed
 
 _REASONS: Final = {
     "times": "times and counters",

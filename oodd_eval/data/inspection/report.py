@@ -4,7 +4,7 @@ import json
 import re
 import textwrap
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -33,7 +33,7 @@ from oodd_eval.data.inspection.meaning import (
 from oodd_eval.data.logs import quantity
 from oodd_eval.data.recipe import MISSING_ROWS
 from oodd_eval.data.stamps import GAP_STEPS
-from oodd_eval.names import counted
+from oodd_eval.names import counted, listed
 
 _MANY: Final = 60  # columns beyond which the table has only those that look like something
 _UNITS: Final = {
@@ -368,13 +368,6 @@ def number(value: float) -> str:
 
 def _share(share: float) -> str:
     return f"{100 * share:.2g} %" if share < 0.995 else f"{100 * share:.3g} %"
-
-
-def listed(names: Sequence[str], most: int = 4) -> str:
-    """Return names in a sentence, of many the first ones and how many more there are."""
-    if len(names) > most:
-        return f"{', '.join(names[: most - 1])} and {len(names) - most + 1} more"
-    return " and ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))
 
 
 def toml(value: Any) -> str:
