@@ -10,7 +10,7 @@ import pytest
 from helpers_submission import Draft
 from oodd_recording import rerun as recording
 from oodd_recording.build import build_split, digest_of_bits
-from oodd_recording.rerun import check_installed, definition_of, draw, earlier, plan_of
+from oodd_recording.rerun import check_installed, chosen, definition_of, draw, earlier, plan_of
 from test_submission_trust import entry, of_three  # noqa: F401  a fixture
 
 from oodd_eval.api import evaluate
@@ -62,6 +62,13 @@ def test_bits_count_for_one_version_of_an_entry_in_any_environments(verdict, tmp
     changed = dataclasses.replace(verdict, digest="e" * 64)
     with pytest.raises(UsageError, match="seeds are drawn for one version of an entry"):
         draw([changed], tmp_path / "again", NAMES)
+
+
+def test_without_environments_named_a_re_run_goes_on_with_those_it_has(verdict, tmp_path):
+    options = SimpleNamespace(env=None, detector="all", seed=None)
+    order = draw([verdict], tmp_path / "again", ["hopper"])
+    assert {r.environment for r in chosen([verdict], options, None)} == {*NAMES}
+    assert {r.environment for r in chosen([verdict], options, order)} == {"hopper"}
 
 
 @pytest.mark.parametrize(

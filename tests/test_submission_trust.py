@@ -14,7 +14,7 @@ from oodd_eval.errors import UsageError
 from oodd_eval.leaderboard.entry import GRANTS, read_entry
 from oodd_eval.leaderboard.submit import Statement, submit
 from oodd_eval.leaderboard.verify import grant, verify_entry
-from oodd_eval.leaderboard.verify.rerun import RerunDifference, RerunOrder, compare_rerun
+from oodd_eval.leaderboard.verify.rerun import Rerun, RerunDifference, RerunOrder, compare_rerun
 from oodd_eval.results.record import Record
 
 THREE = ("cartpole", "acrobot", "hopper")
@@ -259,6 +259,14 @@ def test_a_grant_of_more_environments_replaces_one_of_fewer(entry, tmp_path, fre
             grant(draft.path, compared(draft, records, environments), "me")
     with pytest.raises(UsageError, match="in more environments than before"):
         grant(draft.path, compared(draft, two, THREE[:2]), "me")
+
+
+def test_a_re_run_of_some_rows_is_no_part_of_a_grant_from_scores(submissions, tmp_path):
+    draft = copy(submissions, tmp_path)
+    verdict = verify_entry(draft.path, split=submissions.split)
+    grant(draft.path, dataclasses.replace(verdict, rerun=Rerun("a part", {}, False)), "me")
+    granted = read_entry(draft.path).grant
+    assert (granted.trust, granted.how) == ("re-scored", "every metric recomputed from its scores")
 
 
 def test_where_it_was_computed_makes_no_other_detector(entry, tmp_path, fresh):

@@ -322,7 +322,7 @@ def grant(directory: Path, verdict: EntryVerdict, by: str) -> Grant:
             "(in more environments than before)"
         )
     day = datetime.now(UTC).date().isoformat()
-    if again := verdict.rerun:
+    if (again := verdict.rerun) and level == "re-run":
         new = Grant(verdict.digest, level, by, day, again.how, again.means, again.environments)
     else:
         new = Grant(verdict.digest, level, by, day, "every metric recomputed from its scores")
