@@ -26,7 +26,7 @@ from oodd_eval.results.board import boards
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.render.text import markdown_table
 from oodd_eval.results.unpaired import UnpairedTables
-from oodd_eval.scoring.doubts import promises_of
+from oodd_eval.scoring.promises import promises_of
 
 ROOT = Path(__file__).parents[1]
 PAGE, RECORDS = ROOT / "docs" / "public-logs.md", ROOT / "leaderboard" / "suites" / "logs"

@@ -32,7 +32,7 @@ from oodd_eval.plugins.discovery import discover
 from oodd_eval.results.evaluate import rescore
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
-from oodd_eval.scoring.doubts import promises_of
+from oodd_eval.scoring.promises import promises_of
 
 
 def episodes(seeds, *, drift=0.0, rows=60):

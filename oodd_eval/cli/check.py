@@ -15,7 +15,8 @@ from oodd_eval.cli import (
     refuse,
     say,
 )
-from oodd_eval.cli.terminal import discovered, make_console
+from oodd_eval.cli.console import make_console
+from oodd_eval.cli.plugins import discovered
 from oodd_eval.errors import UnknownNameError
 from oodd_eval.names import assignment, check_known, expression
 from oodd_eval.plugins.conformance import CheckReport

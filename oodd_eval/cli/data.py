@@ -8,7 +8,8 @@ from typing import Any, Final
 import click
 
 from oodd_eval.cli import COUNT, DIRECTORY, Converted, Name, Names, Options, command, say
-from oodd_eval.cli.terminal import make_console, register_formats
+from oodd_eval.cli.console import make_console
+from oodd_eval.cli.plugins import register_formats
 from oodd_eval.data import croissant
 from oodd_eval.data.facts import Quantity
 from oodd_eval.data.fetch import fetch as fetch_split
@@ -22,8 +23,8 @@ from oodd_eval.data.shipped_recipes import shipped_recipes
 from oodd_eval.data.split import SHIPPED, load_split
 from oodd_eval.errors import UsageError
 from oodd_eval.names import assignment, counted, select
-from oodd_eval.results.render.text import print_prose
-from oodd_eval.scoring.doubts import promises_of
+from oodd_eval.prose import print_prose
+from oodd_eval.scoring.promises import promises_of
 
 
 def _quantities(text: str) -> tuple[Quantity, ...]:

@@ -10,7 +10,7 @@ from tabulate import tabulate
 
 from oodd_eval.cli import Name, Options, command, load
 from oodd_eval.cli.listing import KINDS, rows
-from oodd_eval.cli.terminal import discovered
+from oodd_eval.cli.plugins import discovered
 from oodd_eval.data.condition import read_ladder, rungs_of
 from oodd_eval.data.facts import (
     ANOMALIES,

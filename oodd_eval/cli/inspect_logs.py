@@ -7,17 +7,17 @@ from typing import Final
 import click
 
 from oodd_eval.cli import FILE, PARAMETER, Options, command
-from oodd_eval.cli.terminal import make_console, register_formats
+from oodd_eval.cli.console import make_console
+from oodd_eval.cli.plugins import register_formats
 from oodd_eval.data.files import write_text
 from oodd_eval.data.inspection.draft import draft
 from oodd_eval.data.inspection.logs import Inspection, inspect_logs
 from oodd_eval.data.inspection.meaning import sensors_of, window_of
 from oodd_eval.data.inspection.report import describe_logs
 from oodd_eval.errors import OutputError
-from oodd_eval.live.episode_faults import SHORTEST
-from oodd_eval.live.scan import FITS, WINDOWS
+from oodd_eval.live.limits import FITS, SHORTEST, WINDOWS
 from oodd_eval.metrics.outliers import LEAST
-from oodd_eval.results.render.text import print_prose
+from oodd_eval.prose import print_prose
 
 _NO_SENSOR: Final = (
     "No column can be a sensor, so that there is nothing to scan or import: expected columns of "

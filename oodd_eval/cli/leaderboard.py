@@ -11,7 +11,7 @@ import click
 from rich.console import Console
 
 from oodd_eval.cli import DIRECTORY, NAMES, Name, Names, Options, command, expression_option, say
-from oodd_eval.cli.terminal import make_console
+from oodd_eval.cli.console import make_console
 from oodd_eval.data.files import only_writer, temporary_directory
 from oodd_eval.errors import UsageError
 from oodd_eval.leaderboard import hub

@@ -27,7 +27,9 @@ from oodd_eval.cli import (
     say,
     say_notes,
 )
-from oodd_eval.cli.terminal import TerminalReporter, discovered, make_console
+from oodd_eval.cli.console import make_console
+from oodd_eval.cli.plugins import discovered
+from oodd_eval.cli.terminal import TerminalReporter
 from oodd_eval.data.bounded import read_toml
 from oodd_eval.data.files import write_text
 from oodd_eval.data.layout import log_facts
@@ -38,9 +40,9 @@ from oodd_eval.names import counted, expression
 from oodd_eval.plugins import hookimpl
 from oodd_eval.plugins.isolation.child import Limits
 from oodd_eval.plugins.isolation.sandbox import require_sandbox
+from oodd_eval.prose import print_prose
 from oodd_eval.results.directory import REPORT, ResultsDirectory
 from oodd_eval.results.render import FORMATS
-from oodd_eval.results.render.text import print_prose
 from oodd_eval.results.report import Report
 from oodd_eval.scoring.doubts import doubts_after, doubts_before
 from oodd_eval.scoring.executors import LOCAL, RunSettings

@@ -11,7 +11,8 @@ from rich.text import Text
 from tabulate import tabulate
 
 from oodd_eval.cli import COUNT, FILE, PARAM, PARAMETER, Name, Options, command, refuse
-from oodd_eval.cli.terminal import make_console, register_formats
+from oodd_eval.cli.console import make_console
+from oodd_eval.cli.plugins import register_formats
 from oodd_eval.data.files import write_text
 from oodd_eval.data.recipe import Recipe
 from oodd_eval.live.logs import read_logs
@@ -21,7 +22,7 @@ from oodd_eval.live.viewers import write_mcap, write_rerun
 from oodd_eval.live.watchdog import Watchdog
 from oodd_eval.names import counted
 from oodd_eval.plugins.parameters import parameters_by_detector
-from oodd_eval.results.render.text import print_prose
+from oodd_eval.prose import print_prose
 
 _SHARE: Final = click.FloatRange(0, 1, min_open=True, max_open=True)
 _SHARE.name = "SHARE"

@@ -20,7 +20,8 @@ from oodd_eval.cli import (
     say_notes,
     together,
 )
-from oodd_eval.cli.terminal import TerminalReporter, make_console, summary
+from oodd_eval.cli.console import make_console
+from oodd_eval.cli.terminal import TerminalReporter, summary
 from oodd_eval.data.facts import ENVIRONMENTS, in_order
 from oodd_eval.data.split import Split, load_split, split_directories
 from oodd_eval.errors import UsageError

@@ -1,32 +1,24 @@
 """The terminal reporter: an observer that prints what the runner does, and tables at its end."""
 
 import math
-import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from rich.console import Console, ConsoleOptions, RenderableType
-from rich.segment import Segment
+from rich.console import Console
 
 from oodd_eval._version import __version__
-from oodd_eval.cli import Options, say, say_notes
-from oodd_eval.cli.streams import encodable, plain_text, raw
 from oodd_eval.data.facts import PROTOCOL
-from oodd_eval.data.logs import register_readers
-from oodd_eval.data.registry import Spec, register
 from oodd_eval.metrics.bootstrap import nan_mean
 from oodd_eval.metrics.catalogue import metric_info
 from oodd_eval.names import counted
 from oodd_eval.plugins import hookimpl
-from oodd_eval.plugins.discovery import Plugins, discover
-from oodd_eval.plugins.isolation.child import Limits
-from oodd_eval.plugins.isolation.describe import discover_in_sandbox
+from oodd_eval.prose import print_prose
 from oodd_eval.results.board import boards, level_of, ranked_by
 from oodd_eval.results.record import STATUSES, Record
-from oodd_eval.results.render.text import print_prose, print_sections
+from oodd_eval.results.render.text import print_sections
 from oodd_eval.results.report import Report
 from oodd_eval.results.strengths import NO_UNITS
 from oodd_eval.scoring.display import Display
@@ -35,60 +27,6 @@ from oodd_eval.scoring.plan import Plan
 _PART: Final = "trajector(y/ies) of each part"
 
 _COLOURS = {"ok": "green", "unavailable": "yellow", "incompatible": "yellow"}
-
-
-class _Console(Console):
-    """Writes styles and moves of the cursor of its own, and of what it is to print `plain_text`."""
-
-    def render(
-        self, renderable: RenderableType, options: ConsoleOptions | None = None
-    ) -> Iterable[Segment]:
-        for segment in super().render(renderable, options):
-            text = encodable(plain_text(segment.text), self.encoding)
-            yield segment if segment.control else segment._replace(text=text)
-
-    def on_broken_pipe(self) -> None:
-        """Raise the error; rich would end the process with the exit code of a failure."""
-        raise BrokenPipeError
-
-
-def make_console(*, quiet: bool = False, stderr: bool = False) -> Console:
-    """Return a console on a standard stream: coloured on a terminal, plain text in a pipe."""
-    file = raw(sys.stderr if stderr else sys.stdout)
-    console = _Console(file=file, highlight=False, markup=False, soft_wrap=True, quiet=quiet)
-    if console.width < 1:  # COLUMNS=0, as of terminals that do not know their size
-        console.width = 80
-    return console
-
-
-def discovered(options: Options, limits: Limits | None = None) -> Plugins:
-    """Discover plug-ins without those of ``-p``; broken ones are reported on standard error.
-
-    With limits that hide paths, only sandboxes load plug-ins: this process imports none.
-    """
-    if limits is None or limits.hidden is None:
-        plugins = discover(options.disabled)
-    else:
-        plugins = discover_in_sandbox(options.disabled, limits)
-        if watching := ", ".join(point.name for point in plugins.observer_points):
-            say(f"plug-ins that observe runs are left out of a sandboxed one: {watching}")
-    say_notes(plugins.notes)
-    plugins.report_broken_to(
-        lambda b: say(f"plug-in {b.plugin!r} of {b.distribution} is broken: {b.reason}")
-    )
-    return plugins
-
-
-def register_custom(options: Options) -> list[Spec]:
-    """Make environments and anomalies of plug-ins known in this process; return them."""
-    specs = [spec for spec, _ in discovered(options).custom_specs.values()]
-    register(specs)
-    return specs
-
-
-def register_formats(options: Options) -> None:
-    """Make formats of logs of plug-ins known in this process."""
-    register_readers(reader for reader, _ in discovered(options).readers.values())
 
 
 class TerminalReporter(Display):

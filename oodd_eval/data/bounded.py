@@ -12,7 +12,7 @@ import os
 import stat
 import tomllib
 import zipfile
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, Final
@@ -205,3 +205,14 @@ def npy_header(file: IO[bytes]) -> tuple[np.dtype[Any], int]:
     if min(shape, default=0) < 0:
         raise ValueError(f"an array of shape {shape}")
     return dtype, math.prod(shape) * dtype.itemsize
+
+
+def without_nan(value: Any) -> Any:
+    """Return a value for JSON: None in place of numbers that it does not know, at any depth."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(k): without_nan(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [without_nan(v) for v in value]
+    return value

@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 
 from oodd_eval.data.episodes import Episode
 from oodd_eval.data.trajectory import Trajectory
+from oodd_eval.live.limits import SHORTEST
 from oodd_eval.live.stream import FAR, Stream, StreamLimits
 from oodd_eval.metrics.outliers import ODD_SHARE, Tail
 
 Floats = NDArray[np.float64]
 
-SHORTEST: Final = 2
-"""Rows of the shortest episode that is judged."""
 _RUN: Final = 4.0  # half of a run, in rows, that no sensor is called frozen for
 _STEPS: Final = 3.0  # usual steps that a gap is longer than, at least
 

@@ -15,19 +15,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from oodd_eval.data.baseline import Baseline
+from oodd_eval.data.bounded import without_nan
 from oodd_eval.data.episodes import Episode
 from oodd_eval.data.marks import runs_of
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import ContractError, OoddError, UnknownNameError, UsageError
-from oodd_eval.live.episode_faults import (
-    SHORTEST,
-    EpisodeFault,
-    breaks_of,
-    clean,
-    gaps,
-    stream_faults,
-)
+from oodd_eval.live.episode_faults import EpisodeFault, breaks_of, clean, gaps, stream_faults
 from oodd_eval.live.handle import DetectorHandle
+from oodd_eval.live.limits import FITS, SHORTEST, WINDOWS
 from oodd_eval.live.nominal import sensor_names
 from oodd_eval.live.watchdog import Watchdog
 from oodd_eval.metrics.accumulation import AlarmKind, Ranks
@@ -45,14 +40,8 @@ from oodd_eval.metrics.outliers import (
 from oodd_eval.names import counted
 from oodd_eval.plugins.contract import AnyDetector
 from oodd_eval.plugins.explanations import ExplainingDetector, Explanation, checked_explanation
-from oodd_eval.results.record import without_nan
 
 Floats = NDArray[np.float64]
-
-FITS: Final = 20
-"""Most fits: more episodes than this are judged in as many groups, each by a fit on the others."""
-WINDOWS: Final = 40
-"""Windows that a single recording is cut into."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,11 +7,11 @@ from typing import Any, Final
 
 import numpy as np
 
+from oodd_eval.data.bounded import without_nan
 from oodd_eval.data.files import replacing
 from oodd_eval.errors import MissingExtraError
 from oodd_eval.live.reading import as_nanoseconds
 from oodd_eval.live.scan import Scan, ScannedEpisode
-from oodd_eval.results.record import without_nan
 
 _EXTRA: Final = "pip install 'oodd-eval[viewers]'"
 _NUMBER: Final = {"type": ["number", "null"]}

@@ -7,7 +7,6 @@ written as null, so that results can be stored, compared and published as lines 
 import functools
 import itertools
 import json
-import math
 import platform
 import subprocess
 from collections.abc import Iterator, Mapping
@@ -29,6 +28,7 @@ from pydantic import (
 )
 
 from oodd_eval._version import __version__
+from oodd_eval.data.bounded import without_nan
 from oodd_eval.data.condition import Condition
 from oodd_eval.errors import ResultsError
 from oodd_eval.metrics.catalogue import metric_info
@@ -357,17 +357,6 @@ def _other_schema(schema: object) -> str:
         f"has schema {schema!r:.20}, expected {SCHEMA}: it was written by another version of "
         "oodd-eval; run again, or install that version to read it"
     )
-
-
-def without_nan(value: Any) -> Any:
-    """Return a value for JSON: None in place of numbers that it does not know, at any depth."""
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Mapping):
-        return {str(k): without_nan(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [without_nan(v) for v in value]
-    return value
 
 
 PACKAGES: Final = ("h5py", "numpy", "scikit-learn", "scipy", "torch")  # scores depend on them

@@ -1,59 +1,13 @@
 """Reasons to trust or doubt promises on a split, before a run and by the scores of one."""
 
-from collections.abc import Iterator, Sequence
-from itertools import islice
+from collections.abc import Iterator
 
-from oodd_eval.data.baseline import Baseline, episode_means
-from oodd_eval.data.parts import CALIBRATION, EnvironmentData, lengths_of
+from oodd_eval.data.parts import CALIBRATION, lengths_of
 from oodd_eval.data.split import Split
-from oodd_eval.metrics.accumulation import AlarmKind
-from oodd_eval.metrics.alarms import USUAL
-from oodd_eval.metrics.promise import (
-    EpisodeMeans,
-    PromiseFinding,
-    achieved_share,
-    enough_episodes,
-    promises,
-)
+from oodd_eval.metrics.promise import PromiseFinding, achieved_share
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.scoring.plan import Plan
-
-
-def promises_of(
-    data: EnvironmentData, kinds: Sequence[AlarmKind] = USUAL, limit: int | None = None
-) -> list[PromiseFinding]:
-    """Return what speaks for and against promises that rest on an environment of a split.
-
-    Episodes that were recorded by a simulator are exchangeable by construction: of them only the
-    number counts.
-
-    Parameters
-    ----------
-    data
-        The environment.
-    kinds
-        Statistics that are to be thresholds of.
-    limit
-        Number of episodes of each part that are used; None for all.
-
-    Returns
-    -------
-    list of PromiseFinding
-    """
-    if data.logs is None:
-        return [enough_episodes(len(data.calibration.lengths[:limit]), kinds)]
-    rows = data.baseline
-    base = Baseline.fit(islice(data.train, limit), rows) if rows else None
-    parts = (islice(part, limit) for part in (data.train, data.calibration, data.twins))
-    train, calibration, nominal = (EpisodeMeans(*episode_means(part, base)) for part in parts)
-    return promises(
-        train,
-        calibration,
-        nominal,
-        sensors=[quantity.name for quantity in data.sensors],
-        recorded=_in_recorded_order(data),
-        kinds=kinds,
-    )
+from oodd_eval.scoring.promises import in_recorded_order, promises_of
 
 
 def doubts_before(plan: Plan, split: Split) -> Iterator[tuple[str, PromiseFinding]]:
@@ -95,7 +49,7 @@ def doubts_after(
     with split.opened() as opened:
         for unit in plan.units:
             data = opened(unit.environment)
-            if not _in_recorded_order(data):
+            if not in_recorded_order(data):
                 continue
             lengths = lengths_of({CALIBRATION: data.calibration}, plan.limit)
             scores = results.scores(unit.scores_key, lengths)
@@ -105,7 +59,3 @@ def doubts_after(
             finding = achieved_share(scores.parts[CALIBRATION], unit.alarm, label)
             if finding is not None and finding.doubt:
                 yield unit.environment, finding
-
-
-def _in_recorded_order(data: EnvironmentData) -> bool:
-    return data.logs is not None and data.logs.order == "recorded"

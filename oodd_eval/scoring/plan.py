@@ -293,6 +293,9 @@ def make_unit(
     )
 
 
+_HARNESS: Final = ("oodd_eval", "oodd_checks", "oodd_leaderboard", "oodd_live", "oodd_logs")
+
+
 @functools.cache
 def source_digest(module: str) -> str:
     """Return the SHA-256 of a plug-in's own packages and of the contract's version.
@@ -302,7 +305,7 @@ def source_digest(module: str) -> str:
     provenance.
     """
     content = hashlib.sha256(f"contract {CONTRACT}\0".encode())
-    pending, seen = [module], {"oodd_eval"}
+    pending, seen = [module], {*_HARNESS}
     files: dict[str, bytes] = {}
     while pending:
         top = pending.pop().partition(".")[0]

@@ -15,7 +15,8 @@ from oodd_eval.cli import (
     refuse,
     say_notes,
 )
-from oodd_eval.cli.terminal import discovered, make_console
+from oodd_eval.cli.console import make_console
+from oodd_eval.cli.plugins import discovered
 from oodd_eval.data.facts import PROTOCOL, SPLITS
 from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import MissingExtraError, SplitNotFoundError, UsageError

@@ -25,7 +25,8 @@ from oodd_eval.cli import (
     say,
 )
 from oodd_eval.cli.check import STYLES
-from oodd_eval.cli.terminal import make_console, register_custom
+from oodd_eval.cli.console import make_console
+from oodd_eval.cli.plugins import register_custom
 from oodd_eval.data.condition import Condition
 from oodd_eval.data.facts import ANOMALIES, CUSTOM_SEED_BASES, ENVIRONMENTS, SPLITS, SplitDefinition
 from oodd_eval.data.files import temporary_directory

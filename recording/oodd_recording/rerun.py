@@ -22,8 +22,10 @@ from oodd_eval.cli import (
     jobs_option,
     limit_options,
 )
+from oodd_eval.cli.console import make_console
 from oodd_eval.cli.leaderboard import report, write_grant
-from oodd_eval.cli.terminal import TerminalReporter, discovered, make_console
+from oodd_eval.cli.plugins import discovered
+from oodd_eval.cli.terminal import TerminalReporter
 from oodd_eval.data.facts import ENVIRONMENTS, SPLITS, SplitDefinition, in_order
 from oodd_eval.data.files import find_file, write_text
 from oodd_eval.data.split import Split, load_split, split_places

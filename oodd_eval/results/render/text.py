@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.text import Text
 from tabulate import tabulate
 
+from oodd_eval.prose import print_prose
 from oodd_eval.results.render import renders
 from oodd_eval.results.report import Report, Section
 from oodd_eval.results.tables import Table
@@ -167,13 +168,6 @@ def print_table(table: Table, console: Console, width: int = 0) -> None:
         console.print("")
     if table.note:
         print_prose(table.note + "\n", console, "dim")
-
-
-def print_prose(text: str, console: Console, style: str = "") -> None:
-    """Print a sentence, wrapped between words; no line ends with a space."""
-    for line in Text(text, style).wrap(console, console.width):
-        line.rstrip()
-        console.print(line)
 
 
 def _fitting(table: Table, width: int) -> list[Table]:
