@@ -24,7 +24,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 import oodd_eval
 from oodd_eval.cli.main import main
 from oodd_eval.data import logs
-from oodd_eval.data.logs import Reader, library, readers, register_readers
+from oodd_eval.data.logs import Reader, check_reader, library, readers, register_readers
 from oodd_eval.data.logs.cells import column_names, conventional, nearest_spelling
 from oodd_eval.data.logs.minari import export
 from oodd_eval.data.recording import Recording, Topic, parse_times
@@ -944,7 +944,9 @@ def oodd_readers():
 
 def test_oodd_readers(monkeypatch, tmp_path):
     install(monkeypatch, tmp_path, "plant", READER.replace("NAME", "plant"))
-    reader, origin = discover(only=["plant"]).readers["plant"]
+    reader, origin = discover(only=["plant"]).offered_by("oodd_readers", Reader, check_reader)[
+        "plant"
+    ]
     assert origin == "plug-in 'plant' of oodd-plant"
     monkeypatch.setattr(logs, "_registered", {})
     register_readers([reader])
@@ -973,7 +975,7 @@ def test_a_recipe_names_the_format_of_a_plugin(monkeypatch, tmp_path, capsys):
 def test_a_plugin_takes_no_name_of_ours(monkeypatch, tmp_path):
     install(monkeypatch, tmp_path, "plant", READER.replace("NAME", "csv"))
     plugins = discover(only=["plant"])
-    assert plugins.readers == {}
+    assert plugins.offered_by("oodd_readers", Reader, check_reader) == {}
     assert "cannot be the name of a reader" in plugins.broken[0].reason
     with pytest.raises(PluginError, match="has the suffixes"):
         register_readers([Reader("odd", "a file", ("odd",), print)])

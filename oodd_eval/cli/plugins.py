@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from oodd_eval.cli import Options, say, say_notes
-from oodd_eval.data.logs import register_readers
+from oodd_eval.data.logs import Reader, check_reader, register_readers
 from oodd_eval.data.registry import Spec, register
 from oodd_eval.plugins.discovery import Plugins, discover
 
@@ -42,4 +42,5 @@ def register_custom(options: Options) -> list[Spec]:
 
 def register_formats(options: Options) -> None:
     """Make formats of logs of plug-ins known in this process."""
-    register_readers(reader for reader, _ in discovered(options).readers.values())
+    readers = discovered(options).offered_by("oodd_readers", Reader, check_reader)
+    register_readers(reader for reader, _ in readers.values())

@@ -7,12 +7,11 @@ left out. Plug-ins may also observe runs: those hooks are in `oodd_eval.scoring.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import pluggy
 
 if TYPE_CHECKING:
-    from oodd_eval.data.logs import Reader
     from oodd_eval.data.registry import AnomalySpec, EnvironmentSpec
     from oodd_eval.plugins.contract import DetectorSpec
 
@@ -83,7 +82,7 @@ def oodd_anomalies() -> list[AnomalySpec] | None:
 
 
 @hookspec
-def oodd_readers() -> list[Reader] | None:
+def oodd_readers() -> list[Any] | None:
     """Offer formats of logs, which recipes name and ``oodd-eval data inspect`` recognises.
 
     Called once, when logs are inspected or imported. It has to be quick: import the library of a
@@ -91,7 +90,7 @@ def oodd_readers() -> list[Reader] | None:
 
     Returns
     -------
-    list of Reader
+    list of oodd_logs.Reader
         None stands for an empty list.
     """
 

@@ -28,7 +28,6 @@ from oodd_eval.plugins.specs import MOST_SPECS, plain_spec
 
 if TYPE_CHECKING:
     # A worker discovers detectors, and is to know nothing of environments.
-    from oodd_eval.data.logs import Reader
     from oodd_eval.data.registry import Spec
 
 
@@ -125,8 +124,8 @@ class Offering(Protocol):
     def custom_specs(self) -> list[Spec]:
         """Return its environments and anomalies, checked."""
 
-    def readers(self) -> list[Reader]:
-        """Return its readers of logs, checked."""
+    def listed(self, hook: str, kind: type[_Spec]) -> list[_Spec]:
+        """Return what one of its hooks offers, if these are lists of one kind."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,10 +140,7 @@ class Plugin:
 
     def specs(self) -> list[DetectorSpec]:
         """Return what its `oodd_detectors` returns, checked."""
-        specs: list[DetectorSpec] = []
-        for returned in self.hook.oodd_detectors():
-            specs += map(plain_spec, _list_of(returned, DetectorSpec, f"oodd_detectors of {self}"))
-        return specs
+        return [*map(plain_spec, self.listed("oodd_detectors", DetectorSpec))]
 
     @property
     def form(self) -> str:
@@ -172,26 +168,19 @@ class Plugin:
             with_intermittent,
         )
 
-        specs: list[Spec] = []
-        for returned in self.hook.oodd_environments():
-            specs += _list_of(returned, EnvironmentSpec, f"oodd_environments of {self}")
-        for returned in self.hook.oodd_anomalies():
-            specs += _list_of(returned, AnomalySpec, f"oodd_anomalies of {self}")
-        specs = [*with_intermittent(specs)]
+        environments = self.listed("oodd_environments", EnvironmentSpec)
+        anomalies = self.listed("oodd_anomalies", AnomalySpec)
+        specs = [*with_intermittent([*environments, *anomalies])]
         for spec in specs:
             check_spec(spec)
         return specs
 
-    def readers(self) -> list[Reader]:
-        """Return its readers of logs, checked."""
-        from oodd_eval.data.logs import Reader, check_reader  # noqa: PLC0415
-
-        readers: list[Reader] = []
-        for returned in self.hook.oodd_readers():
-            readers += _list_of(returned, Reader, f"oodd_readers of {self}")
-        for reader in readers:
-            check_reader(reader)
-        return readers
+    def listed(self, hook: str, kind: type[_Spec]) -> list[_Spec]:
+        """Return what one of its hooks offers, if these are lists of one kind."""
+        specs: list[_Spec] = []
+        for returned in getattr(self.hook, hook)():
+            specs += _list_of(returned, kind, f"{hook} of {self}")
+        return specs
 
 
 class Plugins:
@@ -234,10 +223,21 @@ class Plugins:
         """Environments and anomalies of plug-ins by name, with their origin; all are loaded."""
         return self._offered(lambda plugin: plugin.custom_specs())
 
-    @property
-    def readers(self) -> dict[str, tuple[Reader, str]]:
-        """Readers of logs of plug-ins by name, with their origin; all are loaded."""
-        return self._offered(lambda plugin: plugin.readers())
+    def offered_by(
+        self, hook: str, kind: type[_Spec], check: Callable[[_Spec], object]
+    ) -> dict[str, tuple[_Spec, str]]:
+        """Return what a hook of plug-ins offers by name, with its origin; all are loaded.
+
+        A plug-in is broken when `check` raises for something that it offers.
+        """
+
+        def checked(plugin: Offering) -> list[_Spec]:
+            specs = plugin.listed(hook, kind)
+            for spec in specs:
+                check(spec)
+            return specs
+
+        return self._offered(checked)
 
     @property
     def offers(self) -> dict[str, Offer]:
@@ -459,7 +459,7 @@ def offer_of(plugin: str, detector: str) -> Offer:
 def _list_of(returned: object, kind: type[_Spec], hook: str) -> list[_Spec]:
     """Return what a hook returned, if it is a list of specs of one kind: of no class of its own."""
     if type(returned) is not list or not all(type(spec) is kind for spec in returned):
-        expected = f"a list of oodd_eval.{kind.__name__}"
+        expected = f"a list of {kind.__module__.partition('.')[0]}.{kind.__name__}"
         raise PluginError(f"{hook} returned {returned!r:.80}, expected {expected}")
     if len(returned) > MOST_SPECS:
         raise PluginError(f"{hook} returned {len(returned)}, expected at most {MOST_SPECS}")

@@ -7,6 +7,7 @@ from helpers_plugins import install
 
 from oodd_eval import DetectorSpec, evaluate
 from oodd_eval.cli import main as cli
+from oodd_eval.data.logs import Reader, check_reader
 from oodd_eval.errors import PluginError, UnknownNameError
 from oodd_eval.plugins.discovery import discover
 
@@ -146,8 +147,10 @@ def test_other_hooks_are_asked_in_the_same_way(hook, returned, monkeypatch, tmp_
     code = STOPS.replace("@RETURNS@", "return []")
     install(monkeypatch, tmp_path, "odd", f"{code}\n@hookimpl\ndef {hook}(): return {returned}\n")
     plugins = discover()
-    offered = plugins.readers if hook == "oodd_readers" else plugins.custom_specs
-    assert offered is not None
+    if hook == "oodd_readers":
+        plugins.offered_by(hook, Reader, check_reader)
+    else:
+        assert plugins.custom_specs is not None
     assert [broken.plugin for broken in plugins.broken] == ["odd"]
 
 
