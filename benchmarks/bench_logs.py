@@ -25,8 +25,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-
-from oodd_eval.data.logs import readers
+from oodd_logs.readers import readers
 
 DIFFERENT, ROWS, COLUMNS = 20, 5000, 8
 WIDE, WINDOW = 20, 600
@@ -41,7 +40,7 @@ assert main(sys.argv[1:]) == 0
 READ = """
 import sys
 from pathlib import Path
-from oodd_eval.data.logs import readers
+from oodd_logs.readers import readers
 (recording,) = readers()["parquet"].read(Path(sys.argv[1]))
 topic = recording.topics[""]
 total = 0.0

@@ -17,10 +17,11 @@ import time
 import warnings
 from pathlib import Path
 
+from oodd_logs.importing import import_recipe
+from oodd_logs.recipe import Recipe
+from oodd_logs.shipped_recipes import shipped_recipes
+
 from oodd_eval import evaluate
-from oodd_eval.data.importing import import_recipe
-from oodd_eval.data.recipe import Recipe
-from oodd_eval.data.shipped_recipes import shipped_recipes
 from oodd_eval.errors import PromiseWarning
 from oodd_eval.results.board import boards
 from oodd_eval.results.directory import ResultsDirectory

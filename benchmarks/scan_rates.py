@@ -10,8 +10,7 @@ import argparse
 import sys
 
 import numpy as np
-
-from oodd_eval.metrics.outliers import Tail, q_values
+from oodd_logs.scanning.outliers import Tail, q_values
 
 FAMILIES = {
     "normal": lambda rng, n: np.abs(rng.normal(3, 1, n)),

@@ -10,12 +10,13 @@ import types
 import h5py
 import numpy as np
 import pytest
+from oodd_logs import import_frames
+from oodd_logs.importing import import_data, import_recipe
+from oodd_logs.recipe import Recipe
 
-from oodd_eval import evaluate, import_frames, load_split
+from oodd_eval import evaluate, load_split
 from oodd_eval.cli.main import main
 from oodd_eval.data.facts import LogFacts
-from oodd_eval.data.importing import import_data, import_recipe
-from oodd_eval.data.recipe import Recipe
 from oodd_eval.errors import OoddError, OutputError, TrajectoryError, UsageError
 
 
@@ -418,7 +419,7 @@ def test_the_rows_of_a_part_never_all_lie_in_memory(tmp_path):
             np.savez(tmp_path / part / f"run-{i}.npz", observations=values[: 200_000 - i])
     program = (
         "import resource, sys; from pathlib import Path\n"
-        "from oodd_eval.data.importing import import_data\n"
+        "from oodd_logs.importing import import_data\n"
         "root = Path(sys.argv[1])\n"
         "peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
         "before = peak()\n"

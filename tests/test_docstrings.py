@@ -9,6 +9,7 @@ import re
 from pathlib import Path
 
 import griffe
+import oodd_logs
 import pytest
 import yaml
 
@@ -16,7 +17,7 @@ import oodd_eval
 from oodd_eval import errors
 
 ROOT = Path(__file__).parents[1]
-SEARCH = [ROOT, ROOT / "recording", *(ROOT / "detectors").iterdir()]
+SEARCH = [ROOT, *(ROOT / name for name in ("logs", "recording")), *(ROOT / "detectors").iterdir()]
 OPTIONAL = {"oodd_eval.scoring.executors.dask", "oodd_eval.__main__"}
 """Modules that need an extra, or that run the program."""
 
@@ -27,7 +28,11 @@ DIRECTIVE = re.compile(r"^::: (\S+)\n((?:(?: {4}.*)?\n)*)", re.MULTILINE)
 
 
 def test_examples_give_what_they_print():
-    names = {m.name for m in pkgutil.walk_packages(oodd_eval.__path__, "oodd_eval.")} - OPTIONAL
+    names = {
+        module.name
+        for top in (oodd_eval, oodd_logs)
+        for module in pkgutil.walk_packages(top.__path__, f"{top.__name__}.")
+    } - OPTIONAL
     results = {name: doctest.testmod(importlib.import_module(name)) for name in sorted(names)}
     assert not [name for name, result in results.items() if result.failed]
     assert sum(result.attempted for result in results.values()) > 30

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from oodd_logs.episodes import make_episodes, read_episodes
+from oodd_logs.marks import IntervalList, anomalous_cells, merged
+from oodd_logs.recipe import Recipe
+from oodd_logs.recorded import Recorded
+from oodd_logs.recording import Recording, Topic
 
-from oodd_eval.data.episodes import make_episodes, read_episodes
-from oodd_eval.data.marks import IntervalList, anomalous_cells, merged
-from oodd_eval.data.recipe import Recipe
-from oodd_eval.data.recorded import Recorded
-from oodd_eval.data.recording import Recording, Topic
 from oodd_eval.errors import OoddError, TrajectoryError, UnknownNameError, UsageError
 
 
@@ -389,8 +389,8 @@ def test_longer_runs_of_missing_values_are_refused(tmp_path, missing):
 
 
 def test_values_are_held_over_the_blocks_in_which_they_are_read(tmp_path, monkeypatch):
-    monkeypatch.setattr("oodd_eval.data.rows._CELLS", 3)
-    monkeypatch.setattr("oodd_eval.data.rows.TopicRows.__init__", small_steps(3))
+    monkeypatch.setattr("oodd_logs.rows._CELLS", 3)
+    monkeypatch.setattr("oodd_logs.rows.TopicRows.__init__", small_steps(3))
     _, parts = read(gappy(tmp_path), missing="hold")
     rows = parts["train"][0].observations
     assert rows[:, 0].tolist() == [1, 2, 2, 2, 5, 6, 7, 8]
@@ -398,7 +398,7 @@ def test_values_are_held_over_the_blocks_in_which_they_are_read(tmp_path, monkey
 
 
 def small_steps(rows):
-    from oodd_eval.data.rows import TopicRows
+    from oodd_logs.rows import TopicRows
 
     usual = TopicRows.__init__
 

@@ -10,13 +10,13 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from oodd_logs.importing import import_data
+from oodd_logs.readers import quantity
+from oodd_logs.readers.minari import export
 
 from oodd_eval import evaluate, live, load_split
 from oodd_eval.cli.main import main
 from oodd_eval.data.facts import Quantity
-from oodd_eval.data.importing import import_data
-from oodd_eval.data.logs import quantity
-from oodd_eval.data.logs.minari import export
 from oodd_eval.errors import TrajectoryError, UsageError
 
 ROWS, SENSORS = 60, 3

@@ -8,15 +8,15 @@ import tracemalloc
 
 import numpy as np
 import pytest
+from oodd_logs.inspection.columns import ClockFacts, ColumnFacts, time_unit
+from oodd_logs.inspection.draft import draft, draft_recipe
+from oodd_logs.inspection.logs import inspect_logs
+from oodd_logs.inspection.report import advise, describe_logs, looks_like
+from oodd_logs.recipe import Recipe
+from oodd_logs.scanning.logs import read_logs
 
 from oodd_eval.cli.main import main
-from oodd_eval.data.inspection.columns import ClockFacts, ColumnFacts, time_unit
-from oodd_eval.data.inspection.draft import draft, draft_recipe
-from oodd_eval.data.inspection.logs import inspect_logs
-from oodd_eval.data.inspection.report import advise, describe_logs, looks_like
-from oodd_eval.data.recipe import Recipe
 from oodd_eval.errors import TrajectoryError, UnknownNameError, UsageError
-from oodd_eval.live.logs import read_logs
 
 
 def process(rows, seed=0):

@@ -16,6 +16,11 @@ from helpers_plugins import install
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from mcap_ros2.writer import Writer as Ros2Writer
+from oodd_logs import readers as logs
+from oodd_logs.readers import Reader, check_reader, library, readers, register_readers
+from oodd_logs.readers.cells import column_names, conventional, nearest_spelling
+from oodd_logs.readers.minari import export
+from oodd_logs.recording import Recording, Topic, parse_times
 from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Bag2Writer
@@ -23,11 +28,6 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import oodd_eval
 from oodd_eval.cli.main import main
-from oodd_eval.data import logs
-from oodd_eval.data.logs import Reader, check_reader, library, readers, register_readers
-from oodd_eval.data.logs.cells import column_names, conventional, nearest_spelling
-from oodd_eval.data.logs.minari import export
-from oodd_eval.data.recording import Recording, Topic, parse_times
 from oodd_eval.errors import MissingExtraError, PluginError, TrajectoryError, UsageError
 from oodd_eval.plugins.discovery import discover
 
@@ -182,8 +182,8 @@ def test_ranges_of_a_file_of_many_blocks_are_its_rows(tmp_path, monkeypatch):
         cell = '"' + mode.replace('"', '""') + '"' if "a" in mode else mode
         lines.append(f"{a},{b},{cell},{c}")
     path = written(tmp_path, "\n".join(lines))
-    monkeypatch.setattr("oodd_eval.data.logs.tables._BLOCK", 5000)
-    monkeypatch.setattr("oodd_eval.data.logs.tables._PIECE", 700)
+    monkeypatch.setattr("oodd_logs.readers.tables._BLOCK", 5000)
+    monkeypatch.setattr("oodd_logs.readers.tables._PIECE", 700)
     topic = table("csv", path)
     assert topic.rows == 3000
     for start, stop in ((0, 3000), (0, 1), (700, 1800), (2400, 2600), (2999, 3000), (50, 50)):
@@ -983,7 +983,7 @@ def test_a_plugin_takes_no_name_of_ours(monkeypatch, tmp_path):
 
 def test_a_reader_in_a_further_module_is_found(tmp_path, monkeypatch):
     code = "READER = Reader('toy', 'a toy', ('.toy',), print)"
-    (tmp_path / "toy.py").write_text(f"from oodd_eval.data.logs import Reader\n{code}\n")
+    (tmp_path / "toy.py").write_text(f"from oodd_logs.readers import Reader\n{code}\n")
     monkeypatch.setattr(logs, "__path__", [*logs.__path__, str(tmp_path)])
     assert "toy" in logs._ours.__wrapped__()
 

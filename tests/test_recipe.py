@@ -4,8 +4,8 @@ import dataclasses
 import tomllib
 
 import pytest
+from oodd_logs.recipe import KEYS, Recipe, anomaly_name
 
-from oodd_eval.data.recipe import KEYS, Recipe, anomaly_name
 from oodd_eval.errors import UnknownNameError, UsageError
 
 WHOLE = """

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers_public_logs import WRITERS
+from oodd_logs.importing import import_recipe
+from oodd_logs.recipe import Recipe
+from oodd_logs.shipped_recipes import shipped_recipes
 
 from oodd_eval import evaluate, load_split
 from oodd_eval.cli.main import main
-from oodd_eval.data.importing import import_recipe
-from oodd_eval.data.recipe import Recipe
-from oodd_eval.data.shipped_recipes import shipped_recipes
 
 ROOT = Path(__file__).parents[1]
 SPEC = importlib.util.spec_from_file_location("public_logs", ROOT / "benchmarks/public_logs.py")

@@ -9,19 +9,19 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+from oodd_logs import scan_episodes
+from oodd_logs.episodes import EVERY, Episode, read_every_episode
+from oodd_logs.recipe import Recipe
+from oodd_logs.scanning.logs import read_logs
+from oodd_logs.scanning.outliers import LEAST, Tail, critical_p, q_values, rank_p, rank_threshold
+from oodd_logs.scanning.scan_page import PICTURES, page
+from oodd_logs.scanning.viewers import write_mcap, write_rerun
 
-from oodd_eval import scan_episodes
 from oodd_eval.cli.main import main
-from oodd_eval.data.episodes import EVERY, Episode, read_every_episode
-from oodd_eval.data.recipe import Recipe
 from oodd_eval.errors import MissingExtraError, UsageError
 from oodd_eval.live import Watchdog
 from oodd_eval.live.handle import DetectorHandle
-from oodd_eval.live.logs import read_logs
-from oodd_eval.live.scan_page import PICTURES, page
-from oodd_eval.live.viewers import write_mcap, write_rerun
 from oodd_eval.metrics.binomial import clopper_pearson
-from oodd_eval.metrics.outliers import LEAST, Tail, critical_p, q_values, rank_p, rank_threshold
 
 ROOT = Path(__file__).parents[1]
 SENSORS = ["speed", "torque", "current"]
@@ -277,7 +277,7 @@ def test_rows_that_a_detector_adapts_to_are_not_judged(monkeypatch):
             return np.abs(trajectory.observations).sum(axis=1) + 1e6 * (np.arange(150) < 40)
 
     handle = DetectorHandle(Loud(), "score", actions=True, adapts=True, state={"name": "loud"})
-    monkeypatch.setattr("oodd_eval.live.scan._Fit.handle", lambda _: handle)
+    monkeypatch.setattr("oodd_logs.scanning.scan._Fit.handle", lambda _: handle)
     for one in scan_episodes(logs(5), sensors=SENSORS, baseline=40).episodes:
         assert np.isnan(one.scores[:40]).all()
         assert one.largest < 1e5

@@ -21,13 +21,13 @@ import h5py
 import numpy as np
 import pytest
 from helpers_split import make_split
+from oodd_logs.readers import minari
 
 from oodd_eval import load_split
 from oodd_eval.cli.main import main
 from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_eval.data.fetch import fetch
 from oodd_eval.data.layout import split_digest
-from oodd_eval.data.logs import minari
 from oodd_eval.data.parts import parts_of
 from oodd_eval.data.split import SHIPPED, split_directories
 from oodd_eval.errors import DigestError, OutputError, SplitError, SplitNotFoundError, UsageError

@@ -37,12 +37,15 @@ EXIT_CODES: Final = (
 )
 
 DATA: Final[Commands] = {
-    "inspect": ("look at logs, write a first recipe", "oodd_eval.cli.inspect_logs:inspect"),
-    "import": ("import logs of your own as an environment", "oodd_eval.cli.data:import_logs"),
+    "inspect": ("look at logs, write a first recipe", "oodd_logs.commands.inspect_logs:inspect"),
+    "import": (
+        "import logs of your own as an environment",
+        "oodd_logs.commands.imports:import_logs",
+    ),
     "info": ("describe a split", "oodd_eval.cli.data:info"),
     "verify": ("compare a split with its digests", "oodd_eval.cli.data:verify"),
     "fetch": ("verify a copy of a split and install it", "oodd_eval.cli.data:fetch"),
-    "export": ("write a split in another project's format", "oodd_eval.cli.data:export"),
+    "export": ("write a split in another project's format", "oodd_logs.commands.exports:export"),
     "build": ("record a split (extra sim)", "oodd_recording.commands:build"),
     "calibrate": ("find the ladder's strengths (extra sim)", "oodd_recording.commands:calibrate"),
     "page": ("write the page of an environment (extra sim)", "oodd_recording.commands:page"),
@@ -70,7 +73,7 @@ COMMANDS: Final[Mapping[str, Commands]] = {
     "Evaluate": {
         "run": ("fit and score every selected cell", "oodd_eval.cli.run:run"),
         "show": ("print the tables of earlier results", "oodd_eval.cli.show:show"),
-        "scan": ("find odd episodes in recorded logs", "oodd_eval.cli.scan:scan"),
+        "scan": ("find odd episodes in recorded logs", "oodd_logs.commands.scan_logs:scan"),
         "compare": ("compare rows, or results with a reference", "oodd_eval.cli.compare:compare"),
         "forget": ("remove cells from a results directory", "oodd_eval.cli.forget:forget"),
         "reproduce": ("compute the paper's tables and claims", "oodd_paper.command:reproduce"),

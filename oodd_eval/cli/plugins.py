@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from oodd_eval.cli import Options, say, say_notes
-from oodd_eval.data.logs import Reader, check_reader, register_readers
 from oodd_eval.data.registry import Spec, register
 from oodd_eval.plugins.discovery import Plugins, discover
 
@@ -38,9 +37,3 @@ def register_custom(options: Options) -> list[Spec]:
     specs = [spec for spec, _ in discovered(options).custom_specs.values()]
     register(specs)
     return specs
-
-
-def register_formats(options: Options) -> None:
-    """Make formats of logs of plug-ins known in this process."""
-    readers = discovered(options).offered_by("oodd_readers", Reader, check_reader)
-    register_readers(reader for reader, _ in readers.values())

@@ -4,10 +4,10 @@ import re
 
 import pytest
 from helpers_plugins import install
+from oodd_logs.readers import Reader, check_reader
 
 from oodd_eval import DetectorSpec, evaluate
 from oodd_eval.cli import main as cli
-from oodd_eval.data.logs import Reader, check_reader
 from oodd_eval.errors import PluginError, UnknownNameError
 from oodd_eval.plugins.discovery import discover
 

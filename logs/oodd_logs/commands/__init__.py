@@ -1,0 +1,1 @@
+"""Commands that read logs: `data inspect`, `data import`, `data export`, `scan`."""

@@ -1,0 +1,189 @@
+"""``oodd-eval scan``: which recorded episodes are odd, and which of their rows and sensors."""
+
+import json
+import math
+from collections.abc import Iterator, Sequence
+from typing import Final
+
+import click
+import numpy as np
+from rich.text import Text
+from tabulate import tabulate
+
+from oodd_eval.cli import COUNT, FILE, PARAM, PARAMETER, Name, Options, command, refuse
+from oodd_eval.cli.console import make_console
+from oodd_eval.data.files import write_text
+from oodd_eval.live.watchdog import Watchdog
+from oodd_eval.names import counted
+from oodd_eval.plugins.parameters import parameters_by_detector
+from oodd_eval.prose import print_prose
+from oodd_logs.commands.formats import register_formats
+from oodd_logs.recipe import Recipe
+from oodd_logs.scanning.logs import read_logs
+from oodd_logs.scanning.scan import SCANNER, Scan, ScannedEpisode, scan_episodes
+from oodd_logs.scanning.scan_page import NUMBERS, cells, figure, page, summary, titles
+from oodd_logs.scanning.viewers import write_mcap, write_rerun
+
+_SHARE: Final = click.FloatRange(0, 1, min_open=True, max_open=True)
+_SHARE.name = "SHARE"
+_MANY: Final = 40  # episodes of which the table has a line each
+_LARGEST_SHARE: Final = 0.2  # of odd episodes, beyond which they hide one another
+_COLUMNS: Final = (
+    "largest: the episode's largest statistic; p: how often a nominal episode has one that is as "
+    "large; q: the smallest false discovery rate (--fdr) at which the episode is odd."
+)
+_ALWAYS: Final = 5  # columns that are there in any case
+_NEXT: Final = 10  # of more, the nominal ones that it has beside the odd ones
+
+
+@command(
+    "scan logs",
+    "scan logs --html scan.html --json scan.json",
+    "scan logs --recipe arm.toml --detector pe --jobs 4",
+    "scan today --recipe arm.toml --watchdog arm.npz --mcap scan.mcap",
+    plugins=True,
+)
+@click.argument("logs", type=FILE)
+@click.option(
+    "--recipe", type=FILE, help="how the logs are read (default: as `data inspect` has it)"
+)
+@click.option("--format", metavar="NAME", help="of the files (default: by their endings)")
+@click.option(
+    "--read", multiple=True, type=PARAMETER, help="an option of the format; V is JSON or text"
+)
+@click.option("--window", type=COUNT, help="cut recordings into episodes of N rows")
+@click.option("--detector", default=SCANNER, type=Name("detectors"), help="that judges")
+@click.option("--param", multiple=True, type=PARAMETER, help=PARAM)
+@click.option("--watchdog", type=FILE, help="a saved watchdog judges, and nothing is fitted")
+@click.option(
+    "--fdr", default=0.1, type=_SHARE, help="share of nominal ones among those called odd, at most"
+)
+@click.option("--jobs", default=1, type=COUNT, help="fits at a time")
+@click.option("--json", type=FILE, help="write everything as JSON")
+@click.option("--html", type=FILE, help="write a page with a picture of each odd episode")
+@click.option("--rerun", type=FILE, help="write a recording for Rerun, .rrd (extra viewers)")
+@click.option("--mcap", type=FILE, help="write MCAP, for Foxglove and others (extra viewers)")
+def scan(options: Options) -> int:
+    """Tell which recorded episodes are odd, and which of their rows and sensors.
+
+    LOGS is a file, a folder of files, or the directory of a data set; with a recipe, the folder
+    that its files are relative to. Each episode is judged by a fit on the others, whatever labels
+    say. Most have to be nominal. The exit code is 1 when an episode is odd.
+    """
+    if options.watchdog:
+        judges = "is for fits, and --watchdog judges without one: leave out one of them"
+        refuse(options, ["detector", "param", "jobs"], judges)
+    if options.recipe:
+        refuse(options, ["format", "read"], "is said by the recipe: write it there")
+    register_formats(options)
+    recipe = Recipe.load(options.recipe) if options.recipe else None
+    logs = read_logs(
+        options.logs,
+        recipe,
+        options.format or "",
+        dict(options.read),
+        options.window,
+        options.recipe.parent if options.recipe else None,
+    )
+    result = scan_episodes(
+        logs.episodes,
+        sensors=logs.sensors,
+        detector=options.detector,
+        watchdog=Watchdog.load(options.watchdog) if options.watchdog else None,
+        fdr=options.fdr,
+        baseline=logs.baseline,
+        parameters=parameters_by_detector([options.detector], dict(options.param))[
+            options.detector
+        ],
+        jobs=options.jobs,
+    )
+    _print(result, logs.notes, options)
+    if options.json:
+        write_text(options.json, json.dumps(result.as_json(), indent=1, allow_nan=False) + "\n")
+    if options.html:
+        write_text(options.html, page(result, options.logs.resolve().name))
+    if options.rerun:
+        write_rerun(result, options.rerun)
+    if options.mcap:
+        write_mcap(result, options.mcap)
+    return int(bool(result.odd))
+
+
+def _print(result: Scan, notes: Sequence[str], options: Options) -> None:
+    console = make_console()
+    if options.verbosity >= 0:
+        listed = _listed(result, everything=options.verbosity > 0)
+        heads = titles(listed)
+        # Names may have line breaks.
+        lines = [
+            [" ".join(cell.split()) for cell in cells(one, brief=True)[: len(heads)]]
+            for one in listed
+        ]
+        kept = [i for i in range(len(heads)) if i < _ALWAYS or any(line[i] for line in lines)]
+        align = ["left", *("right" if heads[i] in NUMBERS else "left" for i in kept)]
+        table = tabulate(
+            [
+                ["odd" * one.odd, *(line[i] for i in kept)]
+                for one, line in zip(listed, lines, strict=True)
+            ],
+            ["", *(heads[i] for i in kept)],
+            "simple",
+            disable_numparse=True,
+            colalign=align,
+        )
+        colours = ["", "", *("bold red" * one.odd for one in listed)]
+        for line, colour in zip(table.splitlines(), colours, strict=True):
+            console.print(Text(line.rstrip(), colour))
+        console.print("")
+        left = len(result.episodes) - len(listed)
+        for note in [
+            _COLUMNS,
+            *([f"Not listed: {counted(left, 'less odd episode(s)')} (-v lists all)."] * (left > 0)),
+            *notes,
+            *result.notes,
+            *_on_labels(result, fitted=not options.watchdog),
+        ]:
+            print_prose(note, console)
+    console.print(Text(summary(result)))
+    if result.odd and not options.html and options.verbosity >= 0:
+        console.print(Text("--html FILE writes a page with a picture of each odd episode."))
+
+
+def _on_labels(result: Scan, *, fitted: bool) -> Iterator[str]:
+    """Yield what became of episodes that the logs call anomalous, and whether they are many."""
+    labelled = [one for one in result.episodes if one.label]
+    if not labelled:
+        return
+    missed = [one for one in labelled if not one.odd]
+    anomalous = counted(len(labelled), "episode(s)")
+    yield (
+        f"Anomalous by their labels: {anomalous}, {len(labelled) - len(missed)} of them odd here."
+    )
+    others = [one.largest for one in result.episodes if not one.label]
+    limits = [one.threshold for one in missed if math.isfinite(one.threshold)]
+    if not (fitted and limits and others):
+        return
+    usual, anomalies = np.median(others), np.median([one.largest for one in labelled])
+    yield (
+        f"The largest statistic of these is {figure(anomalies)} in the median, that of the others "
+        f"{figure(usual)}; an episode is odd from about {figure(np.median(limits))} on, as a scan "
+        "does not know which episodes are nominal."
+    )
+    many = len(labelled) > len(result.episodes) * _LARGEST_SHARE
+    yield (
+        "Where more than a fifth are anomalous, they pass for nominal: scan nominal logs alone, or "
+        "judge by a watchdog that was fitted on these (--watchdog FILE)."
+        if many
+        else "A detector that is fitted on nominal episodes alone finds smaller faults: use "
+        "`oodd-eval data import` and `run`, or a watchdog (--watchdog FILE)."
+    )
+
+
+def _listed(result: Scan, *, everything: bool) -> list[ScannedEpisode]:
+    """Return the episodes of the table, the oddest first: of many, odd ones and the next to it."""
+    oddest = sorted(
+        result.episodes,
+        key=lambda one: (not one.odd, math.inf if math.isnan(one.p) else one.p, -one.largest),
+    )
+    most = len(oddest) if everything or len(oddest) <= _MANY else len(result.odd) + _NEXT
+    return oddest[:most]

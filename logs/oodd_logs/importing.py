@@ -1,0 +1,551 @@
+"""Import logs as an environment of a split of one's own, which every command then takes.
+
+What a recipe says is done in `oodd_logs.episodes`; here its episodes are written. Where test
+episodes come in pairs, an anomalous episode and its nominal twin have the same name, and metrics
+compare the two from the onset on.
+"""
+
+import dataclasses
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oodd_eval._version import __version__
+from oodd_eval.data import layout
+from oodd_eval.data.facts import (
+    ANOMALIES,
+    ENVIRONMENTS,
+    GROUPS,
+    Group,
+    LogFacts,
+    Quantity,
+    in_order,
+)
+from oodd_eval.data.files import only_writer
+from oodd_eval.data.layout import IMPORTED, Blocks
+from oodd_eval.data.parts import CALIBRATION, TRAIN, TWINS
+from oodd_eval.data.split import Split, data_home
+from oodd_eval.errors import TrajectoryError, UnknownNameError, UsageError
+from oodd_eval.names import check_known
+from oodd_logs.episodes import (
+    EpisodeFacts,
+    EpisodeSource,
+    make_episodes,
+    matching_files,
+    read_episodes,
+)
+from oodd_logs.marks import IntervalList, read_intervals
+from oodd_logs.readers import reader_for, readers
+from oodd_logs.recipe import AnomalousFiles, Interval, NominalFiles, Recipe
+from oodd_logs.recorded import Recorded
+from oodd_logs.selecting import layout_of, select_columns, unnamed_columns
+
+ONSETS: Final = "onsets.csv"
+"""File beside those of a part that names their onsets."""
+
+_ANOMALY: Final = "anomaly"  # kind of episodes in a list of which some are anomalous
+_NAME_BYTES: Final = 200
+
+_Arrays = dict[str, NDArray[Any] | Blocks]
+
+
+Say = Callable[[str], object]
+
+
+def _quiet(_line: str) -> None:
+    pass
+
+
+def import_recipe(
+    recipe: Recipe,
+    root: Path,
+    output: Path | None = None,
+    *,
+    replace: bool = False,
+    progress: Say = _quiet,
+    report: Say = _quiet,
+) -> Split:
+    """Import logs as a recipe says, as one environment of a split.
+
+    A split of that name that was imported gets a further environment.
+
+    Parameters
+    ----------
+    recipe
+        The recipe.
+    root
+        Folder that its files are relative to.
+    output
+        Directory of the split, by default where splits are found.
+    replace
+        Whether an environment of that name that was imported earlier is imported anew.
+    progress
+        Called with the name of each part when it is written.
+    report
+        Called with each line of what was read and what was left out.
+
+    Returns
+    -------
+    Split
+        The split with the environment in it.
+
+    Raises
+    ------
+    UsageError
+        When a name is taken, or files or columns are not there.
+    TrajectoryError
+        When a recording is not as it must be; the message names file and row.
+    """
+    recipe.check()
+    target = _Target.of(recipe, output, replace=replace)
+    with read_episodes(recipe, root) as source:
+        return target.write(source, progress, report)
+
+
+def import_data(
+    name: str,
+    environment: str,
+    *,
+    form: str,
+    train: Path,
+    calibration: Path,
+    test: Path | None = None,
+    sensors: Sequence[Quantity] = (),
+    actions: Sequence[Quantity] = (),
+    discrete: int = 0,
+    groups: Mapping[str, str] | None = None,
+    output: Path | None = None,
+    replace: bool = False,
+    progress: Say = _quiet,
+    report: Say = _quiet,
+) -> Split:
+    """Import parts in one format, of which test episodes have twins: a recipe in short.
+
+    Parameters
+    ----------
+    name
+        Name of the split: no published one.
+    environment
+        Name of the environment: none of the benchmark.
+    form
+        Name of a format, as `oodd_logs.readers.readers` has it.
+    train, calibration
+        Parts with nominal episodes: to fit on, and for the thresholds of alarms. A part is a folder
+        of files, one file, or the directory of a data set.
+    test
+        Folder with the part ``nominal`` of the twins and one part for each anomaly, under its name;
+        None for a split to watch with, which cannot be evaluated.
+    sensors, actions
+        Names and units of the columns; by default the files' own, else numbers.
+    discrete
+        Number of actions where each is a whole number from 0 on, else 0.
+    groups
+        Groups of anomalies that the benchmark does not know, by default ``"dynamics"``.
+    output
+        Directory of the split, by default where splits are found.
+    replace, progress, report
+        As for `import_recipe`.
+
+    Returns
+    -------
+    Split
+        The split with the environment in it.
+
+    Raises
+    ------
+    UsageError
+        When a name is taken or wrong, or a part has nothing to read.
+    TrajectoryError
+        When an episode is not as it must be; the message names its file.
+    """
+    check_known("format", readers(), form)
+    tests = {} if test is None else _test_parts(form, test)
+    files = {kind: _files_of(form, path) for kind, path in tests.items()}
+    kinds = [kind for kind in tests if kind != "nominal"]
+    if test is not None and "nominal" not in tests:
+        raise UsageError(
+            f"{str(test)!r} has {', '.join(tests) or 'nothing'}, expected a part 'nominal', too: "
+            "each anomalous episode needs a nominal twin of the same name to be compared with; "
+            "a recipe imports episodes without twins"
+        )
+    check_known(f"anomaly in {test}", kinds, *(groups or {}))
+    check_known("group", GROUPS, *(groups or {}).values())
+    known = {kind: ANOMALIES[kind].group for kind in kinds if kind in ANOMALIES}
+    group_of = known | cast("dict[str, Group]", dict(groups or {}))
+    anomalous = {
+        kind: AnomalousFiles(files=files[kind], group=group_of.get(kind, "dynamics"))
+        for kind in in_order(kinds, ANOMALIES)
+    }
+    nominal = NominalFiles(
+        train=_files_of(form, train),
+        calibration=_files_of(form, calibration),
+        twins=files.get("nominal", ()),
+    )
+    recipe = Recipe(
+        name,
+        environment,
+        discrete=discrete,
+        paired=True,
+        format=form,
+        intervals=tuple(_onsets(tests[kind] for kind in kinds)),
+        nominal=nominal,
+        anomalous=anomalous,
+    )
+    recipe.check()
+    named = _with_names(recipe, sensors, actions)
+    return import_recipe(named, Path(), output, replace=replace, progress=progress, report=report)
+
+
+def _files_of(form: str, part: Path) -> tuple[str, ...]:
+    """Return the files of a part as patterns that match nothing else."""
+    reader = readers()[form]
+    if not part.exists():
+        raise UsageError(f"{str(part)!r} does not exist, expected {reader.part}, or a folder of it")
+    if not part.is_dir() or reader.fits(part):
+        return (_escaped(part),)
+    files = [p for p in part.iterdir() if p.is_file() and reader.fits(p) and _is_log(p)]
+    if not files:
+        what = " or ".join(f"*{suffix}" for suffix in reader.suffixes) or reader.part
+        raise UsageError(f"{str(part)!r} has no files {what}, expected one an episode")
+    return tuple(map(_escaped, files))
+
+
+def _is_log(path: Path) -> bool:
+    return path.name != ONSETS and not path.name.startswith(".")
+
+
+def _escaped(path: Path) -> str:
+    return re.sub(r"([*?\[])", r"[\1]", str(path))
+
+
+def _test_parts(form: str, folder: Path) -> dict[str, Path]:
+    """Return the parts with test episodes by name, ``nominal`` and the anomalies."""
+    if not folder.is_dir():
+        raise UsageError(f"{str(folder)!r} is no folder, expected one with the test episodes")
+    reader = readers()[form]
+    parts = {
+        path.name if path.is_dir() else path.stem: path
+        for path in sorted(folder.iterdir())
+        if _is_log(path) and (path.is_dir() or reader.fits(path))
+    }
+    # Exports of splits lie beside their training parts.
+    exported = {name: re.fullmatch(r"test-(.+)-v\d+", name) for name in parts}
+    if any(exported.values()):
+        return {match[1]: parts[name] for name, match in exported.items() if match}
+    return parts
+
+
+def _onsets(parts: Iterable[Path]) -> Iterator[Interval]:
+    """Yield the onsets that files beside the episodes name, with the paths of these."""
+    for part in parts:
+        if not (part / ONSETS).exists():
+            continue
+        there = {path.name: path for path in part.iterdir()}
+        there |= {path.stem: path for path in there.values() if path.name != ONSETS}
+        for name, start, stop, kind in read_intervals(part / ONSETS):
+            if name not in there:
+                raise UnknownNameError(f"file of {part / ONSETS}", name, there)
+            yield str(there[name]), start, stop, kind
+
+
+def _with_names(recipe: Recipe, sensors: Sequence[Quantity], actions: Sequence[Quantity]) -> Recipe:
+    """Return a recipe that gives the columns of the first episode some names."""
+    if not sensors and not actions:
+        return recipe
+    path = matching_files(recipe.nominal.train, Path())[0]
+    recording = next(reader_for(path, recipe.format).read(path, recipe.options), None)
+    if recording is None:
+        raise UsageError(f"{path} has no episodes, expected at least one")
+    chosen = select_columns(layout_of(recording), recipe, recording.source)
+    names: dict[str, Any] = {}
+    for kind, columns, quantities in (
+        ("sensors", chosen.sensors, sensors),
+        ("actions", chosen.actions, actions),
+    ):
+        named = [quantity.name for quantity in quantities]
+        choices = recipe.discrete or recording.fields.get("discrete", 0)
+        discrete = kind == "actions" and bool(named and choices)
+        count = int(cast("int", choices)) if discrete else len(columns)
+        if named and (len(named) != count or len({*named}) < len(named)):
+            raise UsageError(
+                f"there are {count} {kind}, named {', '.join(named)}: expected as many different "
+                f"names (--{kind})"
+            )
+        if discrete:
+            names["discrete"] = tuple(named)
+        is_new = quantities and not discrete
+        pairs = zip(quantities if is_new else [c.quantity for c in columns], columns, strict=True)
+        names[kind] = tuple(f"{q.name}[{q.unit}]={c.column}" for q, c in pairs)
+    reward = chosen.reward.column if chosen.reward else ""
+    return dataclasses.replace(recipe, **names, reward=reward)
+
+
+def import_frames(
+    name: str,
+    *,
+    train: Sequence[Any],
+    calibration: Sequence[Any],
+    test: Sequence[Any] | Mapping[str, Sequence[Any]] = (),
+    labels: str | Sequence[str] = (),
+    output: Path | None = None,
+    replace: bool = False,
+    report: Say = print,
+    **keys: Any,
+) -> Split:
+    """Import episodes that are in memory: data frames, arrays or lists of mappings.
+
+    Parameters
+    ----------
+    name
+        Name of the split, and of its environment unless `keys` name that.
+    train, calibration
+        Nominal episodes. An episode is a data frame of pandas or polars with a row a step, an array
+        of shape (rows, sensors), a pair of such an array and one of actions, or a list of mappings
+        from columns to values.
+    test
+        Test episodes by the name of their anomaly, ``"nominal"`` for nominal ones; or a list, in
+        which those with anomalous labels are of the kind ``"anomaly"``.
+    labels
+        Columns that are 0 or false in nominal rows.
+    output
+        Directory of the split, by default where splits are found.
+    replace
+        Whether an environment of that name that was imported earlier is imported anew.
+    report
+        Called with each line of what was read and what was left out.
+    **keys
+        Keys of a recipe: ``sensors``, ``actions``, ``time``, ``rate``, ``baseline`` and so on. All
+        columns that none of them names are sensors by default.
+
+    Returns
+    -------
+    Split
+        As all commands take it.
+
+    Raises
+    ------
+    UsageError
+        When a key is wrong, or the recipe does not fit the episodes.
+    TrajectoryError
+        When an episode is not as it must be; the message names it and its row.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> rows = np.random.default_rng(0).normal(size=(40, 30, 2))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     split = import_frames(
+    ...         "arm", train=rows[:20], calibration=rows[20:], output=Path(folder), report=len
+    ...     )
+    ...     split.environments
+    ('arm',)
+    """
+    from oodd_logs.frames import recordings_of  # noqa: PLC0415  for callers in Python
+
+    tests = dict(test) if isinstance(test, Mapping) else {"": test}
+    columns = [labels] if isinstance(labels, str) and labels else [*labels]
+    content: dict[str, Any] = {"split": name, **({"labels": columns} if columns else {}), **keys}
+    content["nominal"] = {"train": TRAIN, "calibration": CALIBRATION, **keys.get("nominal", {})}
+    tables = keys.get("anomalous", {})
+    kinds = {kind: {"files": kind} for kind in tests if kind not in {"", "nominal"}}
+    content["anomalous"] = {kind: files | tables.get(kind, {}) for kind, files in kinds.items()}
+    if "" in tests:
+        content["anomalous"] = {_ANOMALY: tables.get(_ANOMALY, {})}
+    recipe = Recipe.parse(content, "import_frames")
+    parts = {TRAIN: train, CALIBRATION: calibration}
+    parts |= {f"test/{kind}" if kind else "test": episodes for kind, episodes in tests.items()}
+    either = {TWINS, f"test/{_ANOMALY}"}
+    recorded = [
+        Recorded(recording, Path(title), title, frozenset(either if part == "test" else {part}))
+        for part, episodes in parts.items()
+        for title, recording in recordings_of(part, episodes, recipe.time)
+    ]
+    if not recipe.sensors and recorded:
+        layout_ = layout_of(recorded[0].recording)
+        recipe = dataclasses.replace(recipe, sensors=unnamed_columns(layout_, recipe))
+    target = _Target.of(recipe, output, replace=replace)
+    with make_episodes(recipe, recorded, IntervalList.of(recipe, Path())) as source:
+        return target.write(source, _quiet, report)
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class _Target:
+    """Place of an environment: a new split, or one that was imported earlier."""
+
+    recipe: Recipe
+    directory: Path
+    entries: Mapping[str, Any]
+    replace: bool
+
+    @classmethod
+    def of(cls, recipe: Recipe, output: Path | None, *, replace: bool) -> "_Target":
+        """Return it; `UsageError` when names are taken, by what is not to be replaced."""
+        directory = output or data_home() / recipe.split
+        if not (directory / layout.MANIFEST).exists():
+            return cls(recipe, directory, {}, replace)
+        manifest = layout.read_manifest(directory)
+        name, environment = recipe.split, recipe.environment
+        if manifest["definition"] != _definition(name):
+            raise UsageError(
+                f"{str(directory)!r} holds the split {manifest['name']!r}, which was not imported "
+                f"as {name!r}: choose another name"
+            )
+        if environment in manifest["environments"] and not replace:
+            raise UsageError(
+                f"split {name!r} has an environment {environment!r} already: choose another name, "
+                "or replace it (--replace, replace=True)"
+            )
+        return cls(recipe, directory, manifest["environments"], replace)
+
+    def write(self, source: EpisodeSource, progress: Say, report: Say) -> Split:
+        """Write the episodes as the environment, and the manifest."""
+        recipe, environment = self.recipe, self.recipe.environment
+        facts = LogFacts(
+            paired=recipe.paired,
+            clock=recipe.clock,
+            baseline=recipe.baseline,
+            rate=source.rate,
+            order=recipe.order,
+            offsets=source.offsets,
+            source=recipe.source,
+            licence=recipe.licence,
+            citation=recipe.citation,
+        )
+        with only_writer(self.directory):
+            # Another import may have added an environment meanwhile.
+            entries = self.of(recipe, self.directory, replace=self.replace).entries
+            entry = layout.write_environment(
+                self.directory / f"{environment}.h5",
+                _groups(source, progress, paired=recipe.paired),
+                IMPORTED,
+                sensors=source.sensors,
+                actions=source.actions,
+                custom=layout.own_facts(
+                    environment, discrete=source.discrete, groups=source.groups
+                ),
+                # What earlier versions could import keeps its digest.
+                logs=None if facts == LogFacts() else facts,
+            )
+            entries = {**entries, environment: entry}
+            ordered = {name: entries[name] for name in in_order(entries, ENVIRONMENTS)}
+            versions = {"oodd-eval": __version__, "numpy": np.__version__}
+            layout.write_manifest(self.directory, _definition(recipe.split), ordered, 0, versions)
+        for line in source.notes:
+            report(line)
+        return Split(self.directory)
+
+
+def _definition(name: str) -> dict[str, str]:
+    return {"name": name, "source": IMPORTED}
+
+
+def _groups(source: EpisodeSource, progress: Say, *, paired: bool) -> Iterator[tuple[str, _Arrays]]:
+    """Yield the datasets of each part."""
+    for part, episodes in source.parts.items():
+        is_anomalous = part not in {TRAIN, CALIBRATION, TWINS}
+        if paired and is_anomalous:
+            yield part, _with_twins(source, part, episodes)
+        elif paired:
+            yield part, _rows(source, episodes)
+        else:
+            arrays = _rows(source, episodes) | {
+                "names": _texts([facts.name for facts in episodes]),
+                "tasks": _texts([facts.task for facts in episodes]),
+            }
+            if is_anomalous:
+                intervals = [interval for facts in episodes for interval in facts.intervals]
+                counts = [len(facts.intervals) for facts in episodes]
+                arrays["intervals"] = np.array(intervals, np.int64).reshape(-1, 2)
+                arrays["interval_offsets"] = np.cumsum([0, *counts])
+            yield part, arrays
+        progress(part)
+
+
+def _texts(texts: Sequence[str]) -> NDArray[np.bytes_]:
+    packed = [text.encode("utf-8", "backslashreplace")[:_NAME_BYTES] for text in texts]
+    return np.array(packed, dtype=f"S{max(map(len, packed), default=0) or 1}")
+
+
+def _rows(source: EpisodeSource, episodes: Sequence[EpisodeFacts]) -> _Arrays:
+    """Return the datasets that every part has; the rows are read when they are written."""
+    width, total = len(source.sensors), sum(facts.rows for facts in episodes)
+    steps = total - len(episodes)
+
+    def blocks(columns: slice | int, behind: int) -> Callable[[], Iterator[NDArray[np.float32]]]:
+        def read() -> Iterator[NDArray[np.float32]]:
+            for facts in episodes:
+                for rows in source.blocks(facts, behind=behind):
+                    yield rows[:, columns].astype(np.float32)
+
+        return read
+
+    seeds = [facts.fields.get("seed") for facts in episodes]
+    ended = [bool(facts.fields.get("terminated", False)) for facts in episodes]
+    return {
+        "observations": Blocks((total, width), blocks(slice(width), 0)),
+        "actions": Blocks((steps, len(source.actions)), blocks(slice(width, -1), 1)),
+        "rewards": Blocks((steps,), blocks(-1, 1)),
+        "offsets": np.cumsum([0, *(facts.rows - 1 for facts in episodes)]),
+        "seeds": np.array(range(len(seeds)) if None in seeds else seeds, np.int64),
+        "terminated": np.array(ended, np.uint8),
+    }
+
+
+def _with_twins(source: EpisodeSource, part: str, episodes: Sequence[EpisodeFacts]) -> _Arrays:
+    """Return the datasets of an anomaly, in the order of the twins."""
+    by_name = _by_name(part, episodes)
+    twins = _by_name(TWINS, source.parts[TWINS])
+    if unpaired := sorted(by_name.keys() ^ twins.keys()):
+        problem = "has no nominal twin" if unpaired[0] in by_name else "is missing"
+        raise TrajectoryError(
+            f"{part}: episode {unpaired[0]!r} {problem}, expected the episodes of the twins and no "
+            "others, each under the name of its twin; episodes without twins need a recipe "
+            "without paired = true"
+        )
+    ordered = [by_name[name] for name in twins]
+    pairs = zip(ordered, twins.values(), strict=True)
+    effects = [_effect(source, episode, twin) for episode, twin in pairs]
+    drawn = [dict(facts.fields.get("parameters", {})) for facts in ordered]
+    return _rows(source, ordered) | {
+        "onsets": np.array([facts.intervals[0][0] for facts in ordered], np.int64),
+        "effects": np.array(effects, np.int64),
+        "redraws": np.zeros(len(ordered), np.int64),
+        "parameters": layout.pack_parameters(drawn),
+    }
+
+
+def _by_name(part: str, episodes: Sequence[EpisodeFacts]) -> dict[str, EpisodeFacts]:
+    by_name = {facts.name: facts for facts in episodes}
+    if len(by_name) < len(episodes):
+        names = [facts.name for facts in episodes]
+        double = next(name for name in names if names.count(name) > 1)
+        raise TrajectoryError(f"{part} has two episodes named {double!r}, expected one of each")
+    return by_name
+
+
+def _effect(source: EpisodeSource, episode: EpisodeFacts, twin: EpisodeFacts) -> int:
+    """Return the first row from the onset on that differs from the twin's."""
+    common, width = min(episode.rows, twin.rows), len(source.sensors)
+    if not episode.intervals or episode.intervals[0][0] < 0:
+        raise TrajectoryError(
+            f"{episode.source} has no onset, the first row that may differ, expected 'onset' in "
+            "the file, a line of onsets.csv beside it, or labels, intervals or onset in a recipe"
+        )
+    onset = episode.intervals[0][0]
+    if onset >= common:
+        raise TrajectoryError(
+            f"{episode.source}: the onset is row {onset}, expected 0 to {common - 1}, the last row "
+            "that the episode and its twin both have"
+        )
+    row = onset
+    for blocks in zip(source.blocks(episode, onset), source.blocks(twin, onset), strict=False):
+        rows, nominal = (block[: common - row, :width].astype(np.float32) for block in blocks)
+        differs = (rows != nominal).any(axis=1)
+        if differs.any():
+            return row + int(differs.argmax())
+        row += len(rows)
+    raise TrajectoryError(f"{episode.source} equals its twin from its onset, row {onset}, on")

@@ -1,0 +1,246 @@
+"""A first recipe for logs, as TOML with remarks."""
+
+import fnmatch
+import glob
+import re
+import textwrap
+import tomllib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Final
+
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS
+from oodd_eval.names import listed
+from oodd_logs.inspection.logs import Inspection, inspect_logs
+from oodd_logs.inspection.meaning import (
+    NOMINAL_WORDS,
+    bare_name,
+    cuts_of,
+    fields_of,
+    gap_of,
+    keys_of_fields,
+    lacks_rows,
+    lacks_values,
+    name_of,
+    nominal_values,
+    rate_of,
+    roles_of,
+    sensors_of,
+    sort_files,
+    usable_files,
+    window_of,
+)
+from oodd_logs.inspection.report import number, toml
+from oodd_logs.readers import NO_OPTIONS, Options
+from oodd_logs.recipe import MISSING_ROWS, Recipe
+
+_REASONS: Final = {
+    "times": "times and counters",
+    "counters": "times and counters",
+    "labels": "labels",
+    "empty": "constant or empty",
+    "constant": "constant or empty",
+    "setpoints": "constant in each recording",
+    "text": "text",
+    "partial": "not in all files",
+    "slow": "in topics with few rows",
+}
+"""Why columns are no sensors, in a remark of the recipe, by their role."""
+
+
+def draft_recipe(path: Path, form: str = "", options: Options = NO_OPTIONS) -> Recipe:
+    """Return a first recipe for logs, whose files are relative to their folder.
+
+    Parameters
+    ----------
+    path
+        A file, a folder of files, or the directory of a data set; files of the recipe are relative
+        to the folder, or to the one that the file or data set is in.
+    form, options
+        As of `inspect_logs`.
+
+    Returns
+    -------
+    Recipe
+        What `draft` writes, read.
+
+    Raises
+    ------
+    UsageError, TrajectoryError
+        As `inspect_logs`.
+    """
+    return Recipe.parse(tomllib.loads(draft(inspect_logs(path, form, options))), "the draft")
+
+
+def draft(logs: Inspection, prefix: str = "", name: str = "") -> str:
+    """Return a first recipe for logs as TOML with comments.
+
+    Parameters
+    ----------
+    logs
+        What is in them.
+    prefix
+        Folder of the files as seen from that of the recipe; empty where it is the same.
+    name
+        Of the split and the environment; by default that of the file or folder.
+
+    Returns
+    -------
+    str
+        The recipe; `oodd_logs.recipe.Recipe.parse` takes it.
+    """
+    stem = name or logs.path.resolve().stem
+    name = name_of(stem, "logs", {**SPLITS, **ENVIRONMENTS})
+    lines = [
+        f"# A first recipe for {logs.path.name}, written by `oodd-eval data inspect`.",
+        "# Edit it, then import it with `oodd-eval data import`. What is behind # is not in use.",
+        f"split = {toml(name)}",
+        f"environment = {toml(name)}",
+        '# source = "https://..."  # with licence and citation: `data info` shows them',
+        "",
+        *_draft_rows(logs),
+        *_draft_columns(logs),
+        *_draft_labels(logs),
+        "",
+        "[read]",
+        f"format = {toml(logs.form)}",
+        *(f"{key} = {toml(value)}" for key, value in logs.options.items()),
+    ]
+    if logs.transposed:
+        lines.append(f"transpose = {toml(logs.transposed)}")
+    return "\n".join(map(_remark, [*lines, "", *_draft_files(logs, prefix)])) + "\n"
+
+
+def _remark(line: str) -> str:
+    """Return a line of a recipe; names in a remark have no line break that would end it."""
+    if not line.startswith("#"):
+        return line
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
+
+
+def _draft_rows(logs: Inspection) -> Iterator[str]:
+    """Yield keys that say how rows become episodes."""
+    times = logs.times
+    if len(times) == 1 and len(logs.topics) == 1:
+        ((name, unit),) = times.items()
+        known = "" if unit in {"date", "s"} or "[" in name else f"[{unit}]"
+        if name not in logs.stamps:
+            yield f"time = {toml(f'{name}{known}')}"
+    if times:
+        yield f"rate = {rate_of(logs)}  # rows in a second"
+    else:
+        yield "# rate = 10  # rows in a second, if it is known: then there are alarms per hour"
+    if any(cuts_of(logs)) or len(times) > 1:
+        yield f"gap = {number(gap_of(logs))}  # seconds without a row, at which recordings are cut"
+    window = window_of(logs)
+    is_cut = window > 0 and not lacks_rows(logs)
+    if is_cut:
+        yield f"window = {window}  # rows of an episode, to which long recordings are cut"
+        yield "clock = false  # row t of a window has nothing to do with row t of another"
+    elif window:
+        yield f"# window = {window}  # rows of an episode, once labels, intervals or an onset say"
+        yield "#   which rows are anomalous: without them all windows of a faulty recording count"
+        yield "#   as anomalous, also those before the fault"
+    yield "# baseline = 100  # rows at the start of every episode that are nominal, if they are"
+    if not is_cut:
+        yield "# clock = false  # if row t of one episode has nothing to do with row t of another"
+    yield ""
+
+
+def _draft_columns(logs: Inspection) -> Iterator[str]:
+    """Yield the sensors and what becomes of them."""
+    sensors = sensors_of(logs)
+    if any(name.startswith("obs:") for name in sensors):
+        yield "# sensors and actions are the columns obs:NAME[UNIT] and action:NAME[UNIT]"
+    else:
+        roles = roles_of(logs)
+        yield "sensors = ["
+        yield from (f"  {toml(name)}," for name in sensors)
+        yield "]"
+        yield '# actions = ["cmd*"]  # what was commanded, if columns say so'
+        for reason in dict.fromkeys(_REASONS.values()):
+            names = [name for name in roles if _REASONS.get(roles[name]) == reason]
+            text = f"left out, {reason}: {listed(names, 40)}"
+            yield from textwrap.wrap(
+                text if names else "", 98, initial_indent="# ", subsequent_indent="#   "
+            )
+    facts = {name: logs.columns[name] for name in sensors}
+    if flags := [name for name in sensors if facts[name].flag]:
+        yield f"# flags among them, which may be labels by other names: {listed(flags)}"
+    if angles := [name for name in sensors if facts[name].wraps]:
+        yield f"angles = {toml([*map(bare_name, angles)])}  # become sine and cosine"
+    if any(lacks_values(name, facts[name]) for name in sensors):
+        most = max(max(column.longest, column.leading) for column in facts.values())
+        yield 'missing = "hold"  # the last value; or "drop" rows, or "refuse"'
+        if most > MISSING_ROWS:
+            yield f"missing_rows = {most}  # in a run, at most"
+
+
+def _draft_labels(logs: Inspection) -> Iterator[str]:
+    """Yield the keys that say what is anomalous."""
+    keys = keys_of_fields(logs)
+    if logs.intervals:
+        yield f"intervals = {toml(logs.intervals)}"
+    elif logs.labels:
+        label, *others = logs.labels
+        also = f"  # or {listed(others)}" if others else ""
+        yield f"labels = {toml(label)}{also}"
+        values = nominal_values(logs, label)
+        if values not in {(0.0,), ("H",)}:
+            yield f"nominal_label = {toml(values)}"
+    elif key := next((key for key in ("outcome", "kinds") if key in keys), ""):
+        yield f"{key} = {toml(keys[key])}"
+    else:
+        yield '# labels = "fault"  # a column that is 0 where nominal; or intervals = "labels.csv"'
+    if "task" in keys:
+        yield f"task = {toml(keys['task'])}"
+
+
+def _draft_files(logs: Inspection, prefix: str) -> Iterator[str]:
+    """Yield the tables that say which files are nominal, and which have which anomaly."""
+    sorting = sort_files(logs)
+    files = list(dict.fromkeys(r.file for r in logs.recordings))
+    if others := [file for file in files if file not in usable_files(logs)]:
+        yield f"# left out, as copies of others or with other columns: {listed(others, 40)}"
+    if logs.unreadable:
+        yield f"# left out, as they cannot be read: {listed(logs.unreadable, 40)}"
+        files = list(dict.fromkeys([*files, *logs.unreadable]))
+    yield "[nominal]" + (f"  # {sorting.reason}" if sorting.reason else "")
+    yield f"files = {_globs(files, sorting.nominal, prefix)}"
+    keys = {} if logs.labels or logs.intervals else keys_of_fields(logs)
+    if "kinds" in keys and "outcome" not in keys:
+        values = [v for v in fields_of(logs)[keys["kinds"]] if NOMINAL_WORDS.search(str(v))]
+        yield f"where = {{{toml(keys['kinds'])} = {toml(values)}}}"
+    tested = sorting.anomalous or {"outcome", "kinds"} & {*keys}
+    yield "parts = [0.4, 0.3, 0.3]  # training, calibration and test" + (
+        "" if tested else ", in the order of the files"
+    )
+    for kind, names in sorting.anomalous.items():
+        yield ""
+        yield f"[anomalous.{kind}]"
+        yield f"files = {_globs(files, names, prefix)}"
+        if kind not in ANOMALIES:
+            yield '# group = "sensor"  # by default "dynamics"'
+    if not tested:
+        yield from ("", "# [anomalous.NAME]", '# files = ["faulty/*.csv"]')
+
+
+def _globs(files: Sequence[str], names: Sequence[str], prefix: str) -> str:
+    """Return names among files as TOML, as globs that match no other file where there are some."""
+    globs, left = [], dict.fromkeys(names)
+    for name in names:
+        folder, file = Path(name).parent, Path(name)
+        plain = glob.escape(file.stem)
+        stems = "*", re.sub(r"[\W\d_]*\d[\W\d_]*", "*", plain), re.sub(r"\d+$", "*", plain)
+        for pattern in (str(folder / f"{stem}{file.suffix}") for stem in stems):
+            among = {f for f in files if Path(f).parent == folder and fnmatch.fnmatch(f, pattern)}
+            if name in left and len(among) > 1 and among <= {*left}:
+                globs.append(pattern)
+                left = {kept: None for kept in left if kept not in among}
+        if name in left:
+            globs.append(glob.escape(name))
+            del left[name]
+    globs = [Path(prefix, pattern).as_posix() for pattern in globs]
+    if len(globs) < 4:
+        return toml(globs)
+    return "\n".join(["[", *(f"  {toml(pattern)}," for pattern in globs), "]"])

@@ -1,0 +1,469 @@
+"""Contents of logs: recordings, their columns and clocks, and files that are not as the others."""
+
+import hashlib
+import re
+from collections import Counter, defaultdict
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oodd_eval.errors import TrajectoryError, UsageError
+from oodd_eval.names import check_known
+from oodd_logs.inspection.columns import FEW, ClockFacts, ColumnFacts, parse_dates, time_unit
+from oodd_logs.readers import NO_OPTIONS, Options, Reader, in_order, readers
+from oodd_logs.recording import Column, Recording, Topic
+
+_CELLS: Final = 1 << 20  # of the rows that are in memory at once
+READ_ROWS: Final = 2_000_000
+"""Rows of a topic that are looked at; of a longer one, blocks over all of it."""
+_FIRST: Final = 8  # columns of which the first row may count like a clock
+_ENDS: Final = 2000  # rows at either end of a recording that are compared with others
+_OVERLAP: Final = 20  # rows that two recordings have to share
+_PRIME: Final = np.uint64(0x100000001B3)
+_TIME: Final = re.compile(
+    r"(?:^|[^a-z])(?:time|timestamp|datetime|date|stamp|ts|t)(?:$|[^a-z])", re.IGNORECASE
+)
+_LABEL: Final = re.compile(
+    r"anomal|fault|fail|label|health|attack|alarm|error|class|status|stop|lost|binary",
+    re.IGNORECASE,
+)
+_INTERVALS: Final = ({"file", "start"}, {"file", "onset"})
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingFacts:
+    """Contents of one recording.
+
+    Parameters
+    ----------
+    name, source
+        As the reader names it.
+    file
+        Its file, relative to the path that was inspected.
+    rows
+        Number of rows of each topic.
+    columns
+        Names of its columns, below their topics if there are several.
+    clocks
+        Facts of the columns that may have times, by name.
+    stamps
+        Columns that the format defines to be times in seconds.
+    values
+        Cells by value, of each column with few values.
+    fields
+        Values that hold for the whole recording.
+    digest
+        SHA-256 of its rows.
+    head, tail
+        Hashes of some first and last rows, without times, texts and flags.
+    """
+
+    name: str
+    source: str
+    file: str
+    rows: Mapping[str, int]
+    columns: tuple[str, ...]
+    clocks: Mapping[str, ClockFacts]
+    stamps: frozenset[str]
+    values: Mapping[str, Mapping[float | str, int]]
+    fields: Mapping[str, Any]
+    digest: str
+    head: NDArray[np.uint64]
+    tail: NDArray[np.uint64]
+
+    @property
+    def length(self) -> int:
+        """Rows of the longest topic."""
+        return max(self.rows.values(), default=0)
+
+
+@dataclass(slots=True)
+class Inspection:
+    """Contents of logs, and the roles that columns may have.
+
+    Parameters
+    ----------
+    path
+        The file or folder.
+    form
+        Name of the format.
+    options
+        Options with which the files were read.
+    recordings
+        Facts of each recording, in the order of the files.
+    columns
+        Facts of each column by name, over all recordings.
+    transposed
+        Files whose rows and columns are exchanged; they were read so.
+    equal
+        Groups of files, or of recordings within a file, with the same rows.
+    shared
+        Number of recordings that also stand in another file, by file, of those not in `equal`.
+    continued
+        Two files, the last rows of the first of which are the first of the second, and how many.
+    intervals
+        File that says which rows of others are anomalous; empty without one.
+    others
+        Number of files of other formats, by ending.
+    problems, unreadable
+        What could not be read, and the files that it is in.
+    """
+
+    path: Path
+    form: str
+    options: dict[str, Any] = field(default_factory=dict)
+    recordings: list[RecordingFacts] = field(default_factory=list)
+    columns: dict[str, ColumnFacts] = field(default_factory=dict)
+    transposed: list[str] = field(default_factory=list)
+    equal: list[list[str]] = field(default_factory=list)
+    shared: dict[str, int] = field(default_factory=dict)
+    continued: list[tuple[str, str, int]] = field(default_factory=list)
+    intervals: str = ""
+    others: Counter[str] = field(default_factory=Counter)
+    problems: list[str] = field(default_factory=list)
+    unreadable: list[str] = field(default_factory=list)
+
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """Names of the topics, in their order."""
+        return tuple(dict.fromkeys(t for r in self.recordings for t in r.rows))
+
+    def topic_of(self, name: str) -> str:
+        """Return the topic of a column."""
+        return max((t for t in self.topics if name.startswith(f"{t}.")), key=len, default="")
+
+    def clocks(self, name: str) -> list[tuple[RecordingFacts, ClockFacts]]:
+        """Return the recordings in which a column may have times, with facts of these."""
+        return [(r, r.clocks[name]) for r in self.recordings if name in r.clocks]
+
+    @property
+    def times(self) -> dict[str, str]:
+        """Columns with the times of rows, one a topic, and their units.
+
+        Of those that may be, the one that falls least; none where a hundredth of its steps fall.
+        """
+        chosen: dict[str, str] = {}
+        best: dict[str, float] = {}
+        for name in dict.fromkeys(c for r in self.recordings for c in r.clocks):
+            topic, facts = self.topic_of(name), self.columns[name]
+            stuck = sum(c.steps.falls + c.steps.repeats for _, c in self.clocks(name))
+            share = stuck / max(1, facts.cells)
+            if share < min(0.01, best.get(topic, 1.0)) and facts.missing < facts.cells / 2:
+                chosen[topic], best[topic] = name, share
+        return {
+            name: "s"
+            if name in self.stamps
+            else time_unit(name, [clock for _, clock in self.clocks(name)])
+            for name in chosen.values()
+        }
+
+    @property
+    def stamps(self) -> frozenset[str]:
+        """Columns that the format defines to be times in seconds."""
+        return frozenset(name for r in self.recordings for name in r.stamps)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Columns that may say which rows are anomalous, the likeliest first.
+
+        They have few values, whole numbers with many zeros or texts, and a name that says so, or
+        are missing from some recordings.
+        """
+        chosen = []
+        for name, facts in self.columns.items():
+            values: Mapping[float | str, int] = facts.values or {}
+            numbers = [value for value in values if not isinstance(value, str)]
+            partial = facts.recordings < len(self.recordings) and 0.0 in values
+            often = partial or values.get(0.0, 0) > facts.cells / 4
+            fits = facts.text or (often and all(x == round(x) for x in numbers))
+            says_so = _LABEL.search(name.removeprefix(self.topic_of(name)))
+            if facts.flag and fits and (partial or says_so):
+                chosen.append((len(values) > 2, facts.missing > 0, not facts.text, name))
+        return tuple(name for *_, name in sorted(chosen, key=lambda row: row[:-1]))
+
+    def add(self, recording: Recording, file: str) -> None:
+        """Read the rows of a recording in blocks and keep what is in them."""
+        columns: dict[str, ColumnFacts] = {}
+        before: dict[str, Counter[float | str]] = {}
+        clocks: dict[str, ClockFacts] = {}
+        digest = hashlib.sha256()
+        head = tail = np.empty(0, np.uint64)
+        for topic_name, topic in recording.topics.items():
+            below = f"{topic_name}." if topic_name else ""
+            facts = {
+                name: self.columns.setdefault(f"{below}{name}", ColumnFacts())
+                for name in topic.names
+            }
+            columns |= {f"{below}{name}": column for name, column in facts.items()}
+            for name, column in facts.items():
+                before[f"{below}{name}"] = Counter(column.values or {})
+                column.begin()
+            stamps: dict[str, list[tuple[int, NDArray[np.float64]]]] = {}
+            dated: dict[str, bool] = {}
+            hashed: list[str] = []
+            following = 0
+            for start, block in _blocks(topic):
+                if not start:
+                    likely = [name for name in block if _may_be_time(topic, name, block[name])]
+                    stamps = {name: [] for name in likely}
+                    dated = {name: block[name].dtype.kind == "U" for name in likely}
+                    hashed = sorted(name for name in block if _varies(block[name]))
+                    hashed = [name for name in hashed if name not in likely]
+                for name, cells in block.items():
+                    if start != following:
+                        facts[name].leap()
+                    facts[name].add(cells)
+                    digest.update(cells.tobytes())
+                rows = _row_hashes([block[name] for name in hashed])
+                head = np.append(head, rows[: _ENDS - len(head)])
+                tail = np.append(tail, rows)[-_ENDS:]
+                following = start + len(next(iter(block.values())))
+                for name in [*stamps]:
+                    times = parse_dates(block[name]) if dated[name] else block[name]
+                    if times is None or times.dtype.kind == "U":
+                        del stamps[name]
+                    else:
+                        stamps[name].append((start, times))
+            for name, blocks in stamps.items():
+                if clock := ClockFacts.of(blocks, dated=dated[name]):
+                    clocks[f"{below}{name}"] = clock
+        topics = recording.topics.items()
+        self.recordings.append(
+            RecordingFacts(
+                recording.name,
+                recording.source,
+                file,
+                {name: topic.rows for name, topic in topics},
+                tuple(columns),
+                clocks,
+                frozenset(f"{n}.{t.time}" if n else t.time for n, t in topics if t.time),
+                {name: c.values - before[name] for name, c in columns.items() if c.values},
+                dict(recording.fields),
+                digest.hexdigest(),
+                head,
+                tail,
+            )
+        )
+
+
+def inspect_logs(
+    path: Path,
+    form: str = "",
+    options: Options = NO_OPTIONS,
+    progress: Callable[[str], None] = lambda _file: None,
+) -> Inspection:
+    """Look at a file, a folder of files, or the directory of a data set.
+
+    Rows are read in blocks. Of a topic with more than two million rows, blocks over all of it are.
+
+    Parameters
+    ----------
+    path
+        What to look at.
+    form
+        Name of the format; by default it is recognised.
+    options
+        Options of reading, as in a recipe's ``[read]`` table.
+    progress
+        Called with the name of each file before it is read.
+
+    Returns
+    -------
+    Inspection
+        What is there. A file that cannot be read is among its problems.
+
+    Raises
+    ------
+    UsageError
+        When there is nothing of a known format, or an option is unknown.
+    TrajectoryError
+        When no file can be read.
+    """
+    reader, files, others = recognised(path, form)
+    check_known(f"option of the format {reader.name}", reader.options, *options)
+    result = Inspection(path, reader.name, dict(options), others=others)
+    names = {
+        file: file.name if file == path else file.relative_to(path).as_posix() for file in files
+    }
+    later: list[tuple[Path, Recording]] = []
+    for file in files:
+        progress(names[file])
+        try:
+            for recording in reader.read(file, options):
+                columns = {n for topic in recording.topics.values() for n in topic.names}
+                if any(expected <= columns for expected in _INTERVALS):
+                    result.intervals = names[file]
+                elif _unnamed(recording) and "transpose" in reader.options:
+                    later.append((file, recording))
+                else:
+                    result.add(recording, names[file])
+        except TrajectoryError as error:
+            result.problems.append(str(error))
+            result.unreadable.append(names[file])
+    exchanged = set() if "transpose" in options else _exchanged(later)
+    result.transposed = [names[file] for file in files if file in exchanged]
+    for file, recording in later:
+        if file not in exchanged:
+            result.add(recording, names[file])
+    for file in filter(exchanged.__contains__, files):
+        for recording in reader.read(file, {**options, "transpose": True}):
+            result.add(recording, names[file])
+    if result.problems and not result.recordings:
+        raise TrajectoryError(result.problems[0])
+    places = {name: i for i, name in enumerate(names.values())}
+    result.recordings.sort(key=lambda recording: places[recording.file])
+    result.equal = _equal(result.recordings)
+    result.shared = _shared(result.recordings, {file for same in result.equal for file in same})
+    result.continued = _continued(result.recordings)
+    return result
+
+
+def recognised(path: Path, form: str) -> tuple[Reader, list[Path], Counter[str]]:
+    """Return the reader of a path, its files in order, and the number of others by ending."""
+    known = readers()
+    if form:
+        check_known("format", known, form)
+        known = {form: known[form]}
+    if not path.exists():
+        raise UsageError(f"{str(path)!r} does not exist, expected a file or folder of logs")
+    if path.is_dir():
+        for reader in known.values():
+            for candidates in ([path], sorted(filter(Path.is_dir, path.iterdir()))):
+                if sets := [directory for directory in candidates if reader.fits(directory)]:
+                    return reader, sets, Counter()
+    files = [path] if path.is_file() else sorted(_files(path), key=lambda f: in_order(str(f)))
+    by_reader: dict[str, list[Path]] = defaultdict(list)
+    for file in files:
+        best = max(known.values(), key=lambda reader: reader.fits(file))
+        if best.fits(file) or (form and path.is_file()):
+            by_reader[best.name].append(file)
+    if not by_reader:
+        endings = ", ".join(sorted({s for reader in known.values() for s in reader.suffixes}))
+        raise UsageError(
+            f"{str(path)!r} has no files of a known format, expected names that end in {endings}; "
+            "--format says which it is"
+        )
+    name = max(by_reader, key=lambda reader: len(by_reader[reader]))
+    left_out = {*files} - {*by_reader[name]}
+    return known[name], by_reader[name], Counter(file.suffix for file in left_out)
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    for file in folder.rglob("*"):
+        if file.is_file() and not any(p.startswith(".") for p in file.relative_to(folder).parts):
+            yield file
+
+
+def _varies(cells: Column) -> bool:
+    """Tell whether a column is of numbers that are not few."""
+    return cells.dtype.kind == "f" and len(np.unique(cells[:1000])) > FEW
+
+
+def _row_hashes(columns: Sequence[Column]) -> NDArray[np.uint64]:
+    hashes = np.zeros(len(columns[0]) if columns else 0, np.uint64)
+    for cells in columns:
+        hashes = hashes * _PRIME ^ np.ascontiguousarray(cells).view(np.uint64)
+    return hashes
+
+
+def _continued(recordings: Sequence[RecordingFacts]) -> list[tuple[str, str, int]]:
+    """Return files of which the last rows of the first are the first of the second."""
+    beginning: dict[int, list[RecordingFacts]] = defaultdict(list)
+    for recording in recordings:
+        if len({*recording.head[:_OVERLAP].tolist()}) == _OVERLAP:
+            beginning[int(recording.head[0])].append(recording)
+    first_rows = np.array([*beginning], np.uint64)
+    continuations = []
+    for recording in recordings:
+        tail = recording.tail
+        for i in np.flatnonzero(np.isin(tail, first_rows)).tolist():
+            n = len(tail) - i
+            for other in beginning[int(tail[i])]:
+                is_whole = n == recording.length == other.length
+                if n >= _OVERLAP and not is_whole and np.array_equal(tail[i:], other.head[:n]):
+                    continuations.append((recording.file, other.file, n))
+    return continuations
+
+
+def _equal(recordings: Sequence[RecordingFacts]) -> list[list[str]]:
+    """Return the files that have the same rows as others, and the recordings of one file."""
+    digests: dict[str, list[str]] = defaultdict(list)
+    for recording in recordings:
+        digests[recording.file].append(recording.digest)
+    groups: dict[tuple[str, ...], list[str]] = defaultdict(list)
+    for file, rows in digests.items():
+        groups[tuple(rows)].append(file)
+    if len(digests) == 1:
+        for recording in recordings:
+            groups[recording.digest, ""].append(recording.name)
+    return [same for same in groups.values() if len(same) > 1]
+
+
+def _shared(recordings: Sequence[RecordingFacts], equal: Collection[str]) -> dict[str, int]:
+    """Return how many recordings of each file, but for equal ones, stand in another, too."""
+    files: dict[str, set[str]] = defaultdict(set)
+    for recording in recordings:
+        files[recording.digest].add(recording.file)
+    counts = Counter(r.file for r in recordings if len(files[r.digest]) > 1)
+    return {file: n for file, n in counts.items() if file not in equal}
+
+
+def _unnamed(recording: Recording) -> bool:
+    """Tell whether columns are numbered, as those of a matrix or of a text without a header."""
+    if len(recording.topics) != 1:
+        return False
+    (topic,) = recording.topics.values()
+    stems = {re.sub(r"\d+(\[.*\])?$", "", name) for name in topic.names}
+    return len(stems) == 1 and len(topic.names) > 1
+
+
+def _exchanged(matrices: Sequence[tuple[Path, Recording]]) -> set[Path]:
+    """Return the files whose rows are columns.
+
+    The first row counts like a clock, or there are as many rows as neighbours have columns, or
+    there is no neighbour to compare with and there are three times as many columns as rows.
+    """
+    topics = [(file, next(iter(recording.topics.values()))) for file, recording in matrices]
+    tall = Counter(len(t.names) for _, t in topics if t.rows > len(t.names))
+    exchanged = set()
+    for file, topic in topics:
+        wide = len(topic.names) > topic.rows
+        if _first_row_counts(topic) or (
+            wide and (topic.rows in tall if tall else len(topic.names) >= 3 * topic.rows)
+        ):
+            exchanged.add(file)
+    return exchanged
+
+
+def _first_row_counts(topic: Topic) -> bool:
+    """Tell whether a first row of at least `_FIRST` numbers rises in equal steps."""
+    if len(topic.names) < _FIRST or not topic.rows:
+        return False
+    row = topic.read(topic.names, 0, 1).values()
+    if any(cells.dtype.kind == "U" for cells in row):
+        return False
+    steps = np.diff([float(cells[0]) for cells in row])
+    return bool(steps[0] > 0 and np.allclose(steps, steps[0], rtol=1e-3))
+
+
+def _may_be_time(topic: Topic, name: str, cells: Column) -> bool:
+    if cells.dtype.kind == "U":
+        return bool(cells[0]) and parse_dates(cells[:3]) is not None
+    return name == topic.time if topic.time else bool(_TIME.search(name))
+
+
+def _blocks(topic: Topic) -> Iterator[tuple[int, dict[str, Column]]]:
+    """Yield rows in blocks with the number of their first; of a long topic some of the blocks."""
+    if not topic.names:
+        return
+    step = max(16, _CELLS // len(topic.names))
+    starts = np.arange(0, topic.rows, step)
+    if topic.rows > READ_ROWS:
+        evenly = np.linspace(0, len(starts) - 1, READ_ROWS // step)
+        starts = starts[np.unique(evenly.astype(np.intp))]
+    for start in starts.tolist():
+        yield start, topic.read(topic.names, start, min(start + step, topic.rows))

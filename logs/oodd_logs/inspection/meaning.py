@@ -1,0 +1,259 @@
+"""Guesses of what logs mean: what each column is, which files are nominal, at which rate they are.
+
+`oodd_logs.inspection.report` puts them into words, `draft` into a recipe.
+"""
+
+import re
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from oodd_eval.data.facts import ANOMALIES
+from oodd_logs.inspection.columns import ColumnFacts
+from oodd_logs.inspection.logs import Inspection, RecordingFacts
+from oodd_logs.selecting import split_unit
+from oodd_logs.stamps import GAP_STEPS
+
+SCALES: Final = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0, "date": 1.0}
+"""Seconds in the units of stamps."""
+
+NOMINAL_WORDS: Final = re.compile(
+    r"(?:^|[^a-z])(?:nominal|normal|healthy|good|free|baseline|reference|no[^a-z]?(?:fault|failure|anomal\w*))"
+    r"(?:$|[^a-z])",
+    re.IGNORECASE,
+)
+_TASK: Final = re.compile(r"(?:^|_)(?:task|setpoint|set_point)(?:_id|_index)?$", re.IGNORECASE)
+_WINDOWS: Final = 100  # episodes that long recordings are cut to, roughly
+_SHORTEST: Final = 50  # rows of a window
+SLOW: Final = 0.1
+"""Share of the rows of the fullest topic, below which one is left out at first."""
+ENOUGH: Final = 38
+"""Nominal episodes of which a third is enough for a threshold."""
+_LAYOUTS: Final = {"onset", "seed", "terminated", "parameters", "discrete", "start"}
+
+
+@dataclass(frozen=True, slots=True)
+class Sorting:
+    """Nominal files, and the files of each anomaly."""
+
+    nominal: tuple[str, ...]
+    anomalous: Mapping[str, tuple[str, ...]]
+    reason: str
+
+
+def roles_of(logs: Inspection) -> dict[str, str]:
+    """Return why each column is no sensor, in a word; an empty text for one that is."""
+    files = {*usable_files(logs)}
+    common = set.intersection(*(set(r.columns) for r in logs.recordings if r.file in files))
+    most = max((facts.cells for facts in logs.columns.values()), default=0)
+    times, labels = logs.times, {*logs.labels}
+
+    def role(name: str, facts: ColumnFacts) -> str:
+        is_what = {
+            "times": name in times,
+            "labels": name in labels,
+            "empty": facts.empty,
+            "text": facts.text,
+            "constant": facts.constant,
+            "counters": facts.counter,
+            "setpoints": facts.set_point,
+            "partial": name not in common,
+            "slow": facts.cells < SLOW * most,
+        }
+        return next((word for word, holds in is_what.items() if holds), "")
+
+    return {name: role(name, facts) for name, facts in logs.columns.items()}
+
+
+def sensors_of(logs: Inspection) -> list[str]:
+    """Return the columns that are sensors of a first recipe."""
+    named = [name for name in logs.columns if name.startswith("obs:")]
+    return named or [name for name, role in roles_of(logs).items() if not role]
+
+
+def fields_of(logs: Inspection) -> dict[str, Counter[Any]]:
+    """Return the values of fields with few values, and episodes with each."""
+    counts: dict[str, Counter[Any]] = defaultdict(Counter)
+    for recording in logs.recordings:
+        for name, value in recording.fields.items():
+            if isinstance(value, str | bool | int) and name not in _LAYOUTS:
+                counts[name][value] += 1
+    most = max(8, len(logs.recordings) // 4)
+    return {name: c for name, c in counts.items() if len(c) <= most}
+
+
+def keys_of_fields(logs: Inspection) -> dict[str, str]:
+    """Return the fields of episodes that are ``"outcome"``, ``"kinds"`` and ``"task"``, by key."""
+    keys: dict[str, str] = {}
+    for name, counts in fields_of(logs).items():
+        if key := _key_of(name, counts):
+            keys.setdefault(key, name)
+    return keys
+
+
+def nominal_values(logs: Inspection, label: str) -> tuple[float | str, ...]:
+    """Return the values of a label that are nominal."""
+    values: Mapping[float | str, int] = logs.columns[label].values or {}
+    if not logs.columns[label].text:
+        return (0.0,)
+    words = [v for v in values if v in {"H", "0"} or NOMINAL_WORDS.search(str(v))]
+    return tuple(words) or (max(values, key=lambda v: values[v]),)
+
+
+def anomalous_rows(recording: RecordingFacts, label: str, nominal: Sequence[float | str]) -> int:
+    """Return the number of rows whose label has none of its nominal values."""
+    return sum(n for v, n in recording.values.get(label, {}).items() if v not in nominal)
+
+
+def usable_files(logs: Inspection) -> list[str]:
+    """Return the files but for those with the rows of one before, or with no column in common.
+
+    Where no column is in all recordings, the files are those with the commonest columns.
+    """
+    copies = {file for same in logs.equal for file in same[1:]}
+    recordings = [r for r in logs.recordings if r.file not in copies]
+    if recordings and not set.intersection(*(set(r.columns) for r in recordings)):
+        ((columns, _),) = Counter(r.columns for r in recordings).most_common(1)
+        recordings = [r for r in recordings if r.columns == columns]
+    return list(dict.fromkeys(r.file for r in recordings))
+
+
+def sort_files(logs: Inspection) -> Sorting:
+    """Tell files apart by labels, else by their names."""
+    files = usable_files(logs)
+    every = {"fault": tuple(files)}
+    if logs.labels:
+        label = logs.labels[0]
+        values = nominal_values(logs, label)
+        rows = [r.file for r in logs.recordings if anomalous_rows(r, label, values)]
+        anomalous = [file for file in files if file in {*rows}]
+        if len(anomalous) < len(files):
+            return _by_kind(files, anomalous, f"files told apart by {label}")
+        return Sorting(tuple(files), every, f"windows told apart by {label}")
+    if logs.intervals:
+        return Sorting(tuple(files), every, "windows told apart by intervals")
+    anomalous = [file for file in files if not NOMINAL_WORDS.search(_words(file))]
+    if len(anomalous) < len(files) and not {"outcome", "kinds"} & {*keys_of_fields(logs)}:
+        return _by_kind(files, anomalous, "files told apart by their names")
+    return Sorting(tuple(files), {}, "")
+
+
+def _words(file: str) -> str:
+    return str(Path(file).with_suffix("")).replace("_", " ")
+
+
+def _by_kind(files: Sequence[str], anomalous: Sequence[str], reason: str) -> Sorting:
+    """Name anomalies by the folders of their files, or by what their names do not share."""
+    parts = {file: re.split(r"[\s_.,/\-]+", _words(file).lower()) for file in files}
+    shared = set.intersection(*map(set, parts.values()))
+    kinds: dict[str, list[str]] = defaultdict(list)
+    for file in anomalous:
+        folder = Path(file).parent.name
+        words = [w for w in parts[file] if not w.isdigit() and w not in shared]
+        name = folder if folder and len({Path(f).parent for f in files}) > 1 else "-".join(words)
+        kinds[name_of(name, "fault", ANOMALIES)].append(file)
+    nominal = tuple(file for file in files if file not in {*anomalous})
+    return Sorting(nominal, {kind: tuple(names) for kind, names in kinds.items()}, reason)
+
+
+def name_of(text: str, otherwise: str, reserved: Mapping[str, Any]) -> str:
+    """Return a text as the name of a split, an environment or an anomaly."""
+    name = re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")[:50].strip("-") or otherwise
+    return f"my-{name}" if name in reserved or name == "nominal" else name
+
+
+def window_of(logs: Inspection) -> int:
+    """Return rows that cut long nominal recordings into enough; 0 where they are short."""
+    nominal = nominal_recordings(logs)
+    rows = int(sum(_resampled(logs, recording) for recording in nominal))
+    window = max(_SHORTEST, rows // _WINDOWS)
+    if len(nominal) >= ENOUGH or rows < 20 * window:
+        return 0
+    digits = len(str(window)) - 2
+    return int(round(window, -digits)) if digits > 0 else window
+
+
+def lacks_rows(logs: Inspection) -> bool:
+    """Tell whether recordings are anomalous of which nothing says since which row."""
+    keys, anomalous = keys_of_fields(logs), sort_files(logs).anomalous
+    if logs.labels or logs.intervals:
+        return False
+    if {"outcome", "kinds"} & {*keys}:
+        return True
+    files = {file for names in anomalous.values() for file in names}
+    return any(r.file in files and "onset" not in r.fields for r in logs.recordings)
+
+
+def nominal_recordings(logs: Inspection) -> list[RecordingFacts]:
+    """Return the recordings of files that seem to be nominal, at least in part."""
+    files = sort_files(logs).nominal
+    return [recording for recording in logs.recordings if recording.file in files]
+
+
+def _resampled(logs: Inspection, recording: RecordingFacts) -> float:
+    """Return the rows that a recording has at the rate of the recipe."""
+    seconds = [
+        recording.rows[logs.topic_of(name)] * recording.clocks[name].steps.usual * SCALES[unit]
+        for name, unit in logs.times.items()
+        if name in recording.clocks
+    ]
+    return max(seconds) * float(rate_of(logs)) if seconds else recording.length
+
+
+def step_of(logs: Inspection, name: str) -> float:
+    """Return seconds between rows by a column with times, in the median of the recordings."""
+    steps = [clock.steps.usual for _, clock in logs.clocks(name)]
+    return float(np.median(steps)) * SCALES[logs.times[name]]
+
+
+def rate_of(logs: Inspection) -> str:
+    """Return the rows in a second to which recordings are resampled.
+
+    It is the rate of the slowest topic, or of the slowest recording, among those that have at least
+    a tenth of the fastest's: a value that is held for several rows looks like a sensor that stands
+    still.
+    """
+    times = logs.times
+    steps = [step_of(logs, name) for name in times]
+    if len(times) == 1:
+        ((name, unit),) = times.items()
+        steps = [clock.steps.usual * SCALES[unit] for _, clock in logs.clocks(name)]
+    steps = [step for step in steps if step > 0]
+    return f"{1 / max(s for s in steps if s * SLOW <= min(steps)):.4g}" if steps else "1"
+
+
+def gap_of(logs: Inspection) -> float:
+    """Return seconds without a row at which recordings are cut, in steps of the recipe's rate."""
+    return GAP_STEPS / float(rate_of(logs))
+
+
+def cuts_of(logs: Inspection) -> tuple[int, int]:
+    """Return the number of gaps, and of rows that are earlier than the row before."""
+    steps = [clock.steps for name in logs.times for _, clock in logs.clocks(name)]
+    return sum(s.gaps for s in steps), sum(s.falls for s in steps)
+
+
+def lacks_values(name: str, facts: ColumnFacts) -> bool:
+    """Tell whether values are missing, other than commands after the last observation."""
+    after = name.startswith(("action:", "reward")) and facts.missing <= facts.recordings
+    return facts.missing > 0 and not facts.constant and not after
+
+
+def _key_of(name: str, counts: Counter[Any]) -> str:
+    """Return the key of a recipe that a field looks like; an empty text for none."""
+    if len(counts) < 2:
+        return ""
+    if all(isinstance(value, bool) for value in counts):
+        return "outcome"
+    if any(NOMINAL_WORDS.search(str(value)) for value in counts):
+        return "kinds"
+    return "task" if _TASK.search(name) else ""
+
+
+def bare_name(column: str) -> str:
+    """Return the name of a sensor without its prefix and unit, as other keys name it."""
+    return split_unit(re.sub(r"^(obs|action):\s*", "", column))[0]

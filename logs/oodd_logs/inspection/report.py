@@ -1,0 +1,375 @@
+"""A report on logs before they are imported, in words and as a table."""
+
+import json
+import re
+import textwrap
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from tabulate import tabulate
+
+from oodd_eval.names import counted, listed
+from oodd_logs.inspection.logs import READ_ROWS, Inspection
+from oodd_logs.inspection.meaning import (
+    ENOUGH,
+    SCALES,
+    anomalous_rows,
+    bare_name,
+    cuts_of,
+    fields_of,
+    gap_of,
+    keys_of_fields,
+    lacks_rows,
+    lacks_values,
+    nominal_recordings,
+    nominal_values,
+    rate_of,
+    roles_of,
+    sort_files,
+    step_of,
+    window_of,
+)
+from oodd_logs.readers import quantity
+from oodd_logs.recipe import MISSING_ROWS
+from oodd_logs.stamps import GAP_STEPS
+
+_MANY: Final = 60  # columns beyond which the table has only those that look like something
+_UNITS: Final = {
+    "date": "dates",
+    "s": "seconds",
+    "ms": "milliseconds",
+    "us": "microseconds",
+    "ns": "nanoseconds",
+}
+
+
+class Advice(NamedTuple):
+    """Something to know of logs: a word for it, and what it is and what to write into a recipe."""
+
+    topic: str
+    text: str
+
+
+_TEXTS: Final = {
+    "unreadable": "{problem}",
+    "others": "{files} of other formats: {endings}",
+    "sample": "{cells} of {rows} rows were looked at, in blocks over all of them",
+    "equal": "{files}: the same rows; name one, or training has seen the test",
+    "shared": "episodes that stand in another file, too: {counts}; name one of the files, or "
+    "training has seen the test",
+    "continued": "the last {rows} rows of {first} are the first of {second}: leave one out, or "
+    "training has seen the test",
+    "transposed": "rows and columns of {files} are exchanged (and were read so): write "
+    "transpose = {toml} below [read]",
+    "headers": "episodes differ in their columns ({sizes}): not in all, as sensors have to be: "
+    "{names}",
+    "topics": "{n} topics at rates of their own are joined: write rate = {rate}, and sensors as "
+    "topic.field",
+    "time": "{name} has {unit}, a row every {step} s: write {keys}",
+    "rates": "a row every {steps} s in {files}: rate = {rate} resamples all to the slowest, so "
+    "that no value is held for several rows",
+    "gaps": "{gaps} of more than {steps} steps, the longest {longest} s before row {row} of "
+    "{file}: gap = {gap} cuts recordings there",
+    "falls": "{rows} earlier than the row before: gap = {gap} cuts recordings there",
+    "empty": "{names}: no value in any row; leave out",
+    "text": "{names}: text is no sensor; it may be labels, kinds or task",
+    "constant": '{names}: one value only; leave out, or write constant = "drop"',
+    "counters": "{names}: rising without end, a counter or clock, no sensor",
+    "setpoints": "{names}: constant in each recording, different between them: a set point (write "
+    "task = {first}) or a label, no sensor",
+    "missing": "{names}: {share} of values are missing{worst}, up to {longest} in a run{leading}: "
+    'write missing = "hold"{most}',
+    "flags": "{names}: few values; a command, a state, or a label by another name",
+    "angles": "{names}: jumps of a full turn; write angles = {bare}, which makes sine and cosine "
+    "of each",
+    "float32": "{names}: little change for the size ({first}: {spread} around {mean}), which "
+    "float32 would lose: the import subtracts training's mean in float64",
+    "intervals": '{file} names rows of files: write intervals = "{file}"',
+    "labels": "{label} may say what is anomalous: {anomalous} of {rows} rows, in {some} of "
+    '{episodes}: write labels = "{label}"{also}',
+    "fields": "{name} of each episode: {values}{key}",
+    "nominal": "nothing says what is anomalous: all counts as nominal until a recipe names files "
+    "below [anomalous.NAME]",
+    "few": "{episodes}: an alarm that at most 10 % of them raise needs 9 for calibration alone, "
+    "one at 5 % 19 (twice as many for detectors whose alarm is a CUSUM){window}",
+}
+"""Words of advice by topic; what is in braces comes from the logs."""
+
+
+def _say(topic: str, **values: Any) -> Advice:
+    return Advice(topic, _TEXTS[topic].format_map(values))
+
+
+def advise(logs: Inspection) -> list[Advice]:
+    """Return what to know of logs, and what to write into a recipe.
+
+    Parameters
+    ----------
+    logs
+        What is in them.
+
+    Returns
+    -------
+    list of Advice
+        What is amiss with files first, then columns, then what is nominal.
+    """
+    parts = (_of_files, _of_times, _of_columns, _of_labels)
+    return [advice for part in parts for advice in part(logs)]
+
+
+def _of_files(logs: Inspection) -> Iterator[Advice]:
+    for problem in logs.problems[:3]:
+        yield _say("unreadable", problem=problem)
+    if logs.others:
+        endings = ", ".join(f"{n} {s or 'without an ending'}" for s, n in logs.others.items())
+        yield _say("others", files=counted(logs.others.total(), "file(s)"), endings=endings)
+    if any(recording.length > READ_ROWS for recording in logs.recordings):
+        cells = max(column.cells for column in logs.columns.values())
+        yield _say("sample", cells=cells, rows=sum(r.length for r in logs.recordings))
+    for same in logs.equal:
+        yield _say("equal", files=listed(same))
+    if logs.shared:
+        counts = listed([f"{n} of {file}" for file, n in logs.shared.items()])
+        yield _say("shared", counts=counts)
+    for first, second, rows in logs.continued[:3]:
+        yield _say("continued", rows=rows, first=first, second=second)
+    if files := logs.transposed:
+        yield _say("transposed", files=listed(files), toml=toml(files))
+    headers = Counter(r.columns for r in logs.recordings)
+    if len(headers) > 1:
+        partial = [n for n, c in logs.columns.items() if c.recordings < len(logs.recordings)]
+        sizes = ", ".join(f"{len(names)} columns in {n}" for names, n in headers.most_common(3))
+        yield _say("headers", sizes=sizes, names=listed(partial))
+
+
+def _of_times(logs: Inspection) -> Iterator[Advice]:
+    times, rate = logs.times, rate_of(logs)
+    if not times:
+        yield Advice("time", "no column has times: rows count as equally spaced")
+    if len(times) > 1:
+        yield _say("topics", n=len(times), rate=rate)
+    if len(times) != 1:
+        return
+    ((name, unit),) = times.items()
+    clocks, step = logs.clocks(name), step_of(logs, name)
+    known = "" if unit in {"date", "s"} else f"[{unit}]"
+    keys = [] if name in logs.stamps else [f'time = "{name}{known}"']
+    keys += [f"rate = {rate}"] if step > 0 else []
+    yield _say("time", name=name, unit=_UNITS[unit], step=number(step), keys=", ".join(keys))
+    rates = [(r, clock.steps.usual * SCALES[unit]) for r, clock in clocks]
+    if others := [(r.file, other) for r, other in rates if abs(other - step) > 0.1 * step]:
+        steps = listed(sorted({number(other) for _, other in others}))
+        yield _say("rates", files=listed([file for file, _ in others]), steps=steps, rate=rate)
+    gaps, falls = cuts_of(logs)
+    gap = number(gap_of(logs))
+    if gaps:
+        recording, clock = max(clocks, key=lambda pair: pair[1].steps.longest)
+        yield _say(
+            "gaps",
+            gaps=counted(gaps, "gap(s)"),
+            steps=GAP_STEPS,
+            longest=number(clock.steps.longest * SCALES[unit]),
+            row=clock.steps.after + 1,
+            file=recording.file,
+            gap=gap,
+        )
+    if falls:
+        yield _say("falls", rows=counted(falls, "row(s)"), gap=gap)
+
+
+def _of_columns(logs: Inspection) -> Iterator[Advice]:
+    roles = roles_of(logs)
+    for role in ("empty", "text", "constant", "counters", "setpoints"):
+        if names := [name for name in roles if roles[name] == role]:
+            yield _say(role, names=listed(names), first=toml(names[0]))
+    plain = {n: logs.columns[n] for n in roles if roles[n] in {"", "partial", "slow"}}
+    if missing := {n: c.missing / c.cells for n, c in plain.items() if lacks_values(n, c)}:
+        worst = max(missing, key=lambda name: missing[name])
+        longest = max(plain[name].longest for name in missing)
+        leading = max(plain[name].leading for name in missing)
+        yield _say(
+            "missing",
+            names=listed([*missing]),
+            worst=f" in {worst}, fewer in others" if len(missing) > 1 else "",
+            share=_share(missing[worst]),
+            leading=f", {counted(leading, 'row(s)')} at the start" if leading else "",
+            longest=counted(longest, "row(s)"),
+            most=f", missing_rows = {longest}" if longest > MISSING_ROWS else "",
+        )
+    if flags := [name for name, c in plain.items() if c.flag]:
+        yield _say("flags", names=listed(flags))
+    if angles := [name for name, c in plain.items() if c.wraps]:
+        yield _say("angles", names=listed(angles), bare=toml([*map(bare_name, angles)]))
+    if coarse := [name for name, c in plain.items() if c.coarse]:
+        spread, mean = plain[coarse[0]].numbers.spread, plain[coarse[0]].numbers.mean
+        texts = {"spread": number(spread), "mean": number(mean)}
+        yield _say("float32", names=listed(coarse), first=coarse[0], **texts)
+
+
+def _of_labels(logs: Inspection) -> Iterator[Advice]:
+    if logs.intervals:
+        yield _say("intervals", file=logs.intervals)
+    if labels := logs.labels:
+        values = nominal_values(logs, labels[0])
+        anomalous = [anomalous_rows(r, labels[0], values) for r in logs.recordings]
+        yield _say(
+            "labels",
+            label=labels[0],
+            anomalous=sum(anomalous),
+            rows=sum(sum(r.values.get(labels[0], {}).values()) for r in logs.recordings),
+            some=sum(map(bool, anomalous)),
+            episodes=counted(len(logs.recordings), "episode(s)"),
+            also=f"; perhaps {listed(labels[1:])}" if len(labels) > 1 else "",
+        )
+    keys = keys_of_fields(logs)
+    for name, counts in fields_of(logs).items():
+        common = ", ".join(f"{value} ({n})" for value, n in counts.most_common(6))
+        key = "".join(f': write {key} = "{name}"' for key in keys if keys[key] == name)
+        yield _say("fields", name=name, values=common, key=key)
+    if not (sort_files(logs).anomalous or labels or {"outcome", "kinds"} & {*keys}):
+        yield _say("nominal")
+    if 0 < (nominal := len(nominal_recordings(logs))) < ENOUGH:
+        window = window_of(logs)
+        advised = f": window = {window} cuts recordings into more" if window else ""
+        if window and lacks_rows(logs):
+            advised += ", once labels, intervals or an onset say which rows are anomalous"
+        yield _say("few", episodes=counted(nominal, "nominal episode(s)"), window=advised)
+
+
+def looks_like(logs: Inspection) -> dict[str, str]:
+    """Return in words what each column looks like; an empty text for a plain number."""
+    times, roles = logs.times, roles_of(logs)
+
+    def looks(name: str) -> str:
+        facts = logs.columns[name]
+        values = [] if facts.values is None else sorted(facts.values, key=str)
+        texts = ", ".join(v if isinstance(v, str) else number(v) for v in values)
+        match roles[name]:
+            case "times":
+                return f"time ({_UNITS[times[name]]})"
+            case "labels":
+                return f"label? {texts}"
+            case "text":
+                return f"text: {texts}" if values else "text, many values"
+            case "counters":
+                return "counter: never falls"
+            case "empty" | "constant":
+                return roles[name]
+        if facts.flag:
+            return f"flag: {texts}"
+        if facts.wraps:
+            return f"angle that wraps at {number(facts.wraps)}"
+        return "float32 is too coarse" if facts.coarse else ""
+
+    return {name: looks(name) for name in logs.columns}
+
+
+def describe_logs(logs: Inspection, width: int = 80) -> str:
+    """Return what is in logs as text for a terminal.
+
+    Parameters
+    ----------
+    logs
+        What is in them.
+    width
+        Of the terminal, in characters.
+
+    Returns
+    -------
+    str
+        A heading, a table of topics if there are several, one of columns, and advice.
+    """
+    files = len({recording.file for recording in logs.recordings})
+    lengths = [recording.length for recording in logs.recordings] or [0]
+    heading = (
+        f"{logs.path.name or logs.path}: {logs.form}, {counted(files, 'file(s)')}, "
+        f"{counted(len(logs.recordings), 'episode(s)')} of {min(lengths)}"
+    )
+    if min(lengths) < max(lengths):
+        heading += f" to {max(lengths)} rows, {np.median(lengths):g} in the median"
+    else:
+        heading += " rows"
+    parts = ["\n".join(textwrap.wrap(heading, width))]
+    if len(logs.topics) > 1:
+        parts.append(_topic_table(logs))
+    parts.append(_column_table(logs, width))
+    if advice := advise(logs):
+        indent = max(len(topic) for topic, _ in advice) + 2
+        wrapper = textwrap.TextWrapper(
+            min(width, 110), subsequent_indent=" " * indent, break_on_hyphens=False
+        )
+        parts.append("\n".join(wrapper.fill(f"{a.topic:{indent}}{a.text}") for a in advice))
+    return "\n\n".join(parts)
+
+
+def _topic_table(logs: Inspection) -> str:
+    steps = {logs.topic_of(name): step_of(logs, name) for name in logs.times}
+    rows = []
+    for topic in logs.topics:
+        counts = [r.rows[topic] for r in logs.recordings if topic in r.rows]
+        columns = sum(column.startswith(f"{topic}.") for column in logs.columns)
+        rate = f"{1 / steps[topic]:.4g} Hz" if steps.get(topic) else ""
+        rows.append([topic, f"{np.median(counts):g}", rate, str(columns)])
+    header = ["topic", "rows", "rate", "columns"]
+    return str(tabulate(rows, header, "simple", colalign=["left", *["right"] * 3]))
+
+
+def _column_table(logs: Inspection, width: int) -> str:
+    """Return a row for each column; of very many, for those that look like something."""
+    looks, times = looks_like(logs), logs.times
+    names = [*looks]
+    if len(looks) > _MANY:
+        odd = [n for n in looks if looks[n] not in {"", "constant", "empty"} and n not in times]
+        names = odd[:_MANY]
+    rows = []
+    for name in names:
+        facts, column = logs.columns[name], quantity(name) if _WITH_UNIT.fullmatch(name) else None
+        unit = column.unit if column and column.unit != "1" else ""
+        span = ["", ""]
+        if not (facts.text or facts.empty):
+            span = [number(facts.numbers.low), number(facts.numbers.high)]
+        missing = _share(facts.missing / facts.cells) if facts.missing else ""
+        rows.append([column.name if unit and column else name, unit, *span, missing, looks[name]])
+    header = ["column", "unit", "from", "to", "missing", "looks like"]
+    kept = [i for i, title in enumerate(header) if i < 1 or any(row[i] for row in rows)]
+    before = sum(max([len(header[i]), *(len(row[i]) for row in rows)]) + 2 for i in kept if i < 5)
+    for row in rows:
+        row[-1] = "\n".join(textwrap.wrap(row[-1], max(16, width - before)))
+    table = tabulate(
+        [[row[i] for i in kept] for row in rows],
+        [header[i] for i in kept],
+        "simple",
+        colalign=["right" if 1 < i < 5 else "left" for i in kept] if rows else None,
+        disable_numparse=True,
+    )
+    text = "\n".join(line.rstrip() for line in table.splitlines())
+    left_out = len(looks) - len(names)
+    more = f"\n\nand {left_out} more columns, most of them plain numbers or constants"
+    return text + (more if left_out else "")
+
+
+_WITH_UNIT: Final = re.compile(r"[^\[\]]+(\[[^\[\]]+\])?")
+
+
+def number(value: float) -> str:
+    """Return a number as a table has it, whole ones without a point.
+
+    Examples
+    --------
+    >>> number(3.0), number(0.0265878), number(5400123.25)
+    ('3', '0.02659', '5400123')
+    """
+    if np.isfinite(value) and value == round(value) and abs(value) < 1e7:
+        return str(int(value))
+    return f"{value:.4g}" if abs(value) < 1e4 else f"{value:.7g}"
+
+
+def _share(share: float) -> str:
+    return f"{100 * share:.2g} %" if share < 0.995 else f"{100 * share:.3g} %"
+
+
+def toml(value: Any) -> str:
+    """Return a text, number, truth value or a list of them as TOML, which they share with JSON."""
+    return json.dumps(list(value) if isinstance(value, tuple) else value, ensure_ascii=False)

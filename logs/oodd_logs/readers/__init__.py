@@ -1,0 +1,291 @@
+"""Logs of users: recordings as other programs wrote them, read without running anything.
+
+Every module of this package that has a `Reader` named ``READER`` adds a format; plug-ins add
+others by the hook ``oodd_readers``. A reader opens one file (or the directory of a data set) and
+yields recordings, whose rows are read when they are asked for.
+"""
+
+import contextlib
+import dataclasses
+import fnmatch
+import functools
+import importlib
+import pkgutil
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Final
+
+from oodd_eval.data.facts import NAME_PATTERN, Quantity
+from oodd_eval.errors import (
+    MissingExtraError,
+    OoddError,
+    PluginError,
+    TrajectoryError,
+    UnknownNameError,
+    UsageError,
+)
+from oodd_eval.names import check_known
+from oodd_logs.recording import Column, Recording, Topic
+
+Options = Mapping[str, Any]
+"""Values of a recipe's ``[read]`` table by name, without the format."""
+
+NO_OPTIONS: Final[Options] = MappingProxyType({})
+
+TOPICS: Final = {"topics": "list of globs over the names of topics"}
+TRANSPOSE: Final = {"transpose": "true, or globs of the files in which a row is a sensor"}
+
+
+@dataclass(frozen=True, slots=True)
+class Reader:
+    """A format of logs.
+
+    Parameters
+    ----------
+    name
+        As recipes choose it: lower-case letters, digits and hyphens.
+    part
+        What `read` opens, for messages: ``"a CSV file"``.
+    suffixes
+        Endings of file names by which the format is recognised, in lower case and with the dot.
+    open
+        Called with the path of a file or directory and the options of the recipe; yields its
+        recordings. It may raise anything for content that is damaged.
+    extra
+        Extra of the project whose libraries the format needs; empty where it needs none.
+    options
+        Names of the options that it takes, with what they are.
+    directory_markers
+        Paths relative to a directory by which a data set in one is recognised, as globs:
+        ``"meta/info.json"``. Empty for formats that are files.
+    """
+
+    name: str
+    part: str
+    suffixes: tuple[str, ...]
+    open: Callable[[Path, Options], Iterable[Recording]]
+    extra: str = ""
+    options: Mapping[str, str] = field(default_factory=dict)
+    directory_markers: tuple[str, ...] = ()
+
+    def fits(self, path: Path) -> int:
+        """Tell by a name whether a file or directory is of this format.
+
+        Parameters
+        ----------
+        path
+            The file or directory.
+
+        Returns
+        -------
+        int
+            Length of the ending that says so, 1 for a directory; 0 for what is of another format.
+        """
+        if path.is_dir():
+            return int(any(next(path.glob(marker), None) for marker in self.directory_markers))
+        name = path.name.lower()
+        return max((len(suffix) for suffix in self.suffixes if name.endswith(suffix)), default=0)
+
+    def read(self, path: Path, options: Options = NO_OPTIONS) -> Iterator[Recording]:
+        """Yield the recordings of a file, or of the directory of a data set.
+
+        Parameters
+        ----------
+        path
+            The file or directory.
+        options
+            Those of `options` that a recipe sets.
+
+        Yields
+        ------
+        Recording
+            In the order of the file; numbers in names count as numbers.
+
+        Raises
+        ------
+        UsageError
+            When an option is unknown or wrong, or there is nothing at the path.
+        MissingExtraError
+            When a library is not installed.
+        TrajectoryError
+            When the content cannot be read. Reading rows raises it, too.
+        """
+        check_known(f"option of the format {self.name}", self.options, *options)
+        if not path.exists():
+            raise UsageError(f"{str(path)!r} does not exist, expected {self.part}")
+        if path.is_dir() and not self.directory_markers:
+            raise UsageError(f"{str(path)!r} is a directory, expected {self.part}")
+        if not path.is_dir() and not path.is_file():
+            raise TrajectoryError(f"{path} is no plain file")
+        with readable(path):
+            for recording in self.open(path, options):
+                topics = {name: _guarded(t, recording) for name, t in recording.topics.items()}
+                yield dataclasses.replace(recording, topics=topics)
+
+
+def readers() -> Mapping[str, Reader]:
+    """Return the readers by name: the project's, and those of plug-ins that were registered."""
+    return MappingProxyType({**_ours(), **_registered})
+
+
+def reader_for(path: Path, form: str = "") -> Reader:
+    """Return the reader of a format by name, or that of a file or directory.
+
+    Raises
+    ------
+    UnknownNameError
+        When there is no such format.
+    UsageError
+        When the path is of none.
+    TrajectoryError
+        When it is neither a plain file nor a directory.
+    """
+    if not path.is_file() and not path.is_dir():
+        raise TrajectoryError(
+            f"{path} is no plain file, but a broken link, a pipe or a device: remove it"
+        )
+    offered = readers()
+    if form:
+        check_known("format", offered, form)
+        return offered[form]
+    reader = max(offered.values(), key=lambda reader: reader.fits(path))
+    if not reader.fits(path):
+        raise UsageError(
+            f"{path} has no ending of a known format: name it, [read] format = one of "
+            f"{', '.join(offered)}"
+        )
+    return reader
+
+
+def register_readers(offered: Iterable[Reader]) -> None:
+    """Make readers of plug-ins known in this process; `check_reader` says which may be."""
+    for reader in offered:
+        check_reader(reader)
+        _registered[reader.name] = reader
+
+
+def check_reader(reader: Reader) -> None:
+    """Raise `PluginError` for a reader with a wrong name, or one that the project has."""
+    if not re.fullmatch(NAME_PATTERN, str(reader.name)) or reader.name in _ours():
+        raise PluginError(
+            f"{reader.name!r} cannot be the name of a reader, expected lower-case letters, digits "
+            f"and hyphens, and none of {', '.join(_ours())}"
+        )
+    wrong = [s for s in reader.suffixes if s != s.lower() or not s.startswith(".")]
+    if isinstance(reader.suffixes, str) or wrong or not callable(reader.open):
+        raise PluginError(
+            f"reader {reader.name!r} has the suffixes {reader.suffixes!r:.80}, expected a tuple of "
+            "lower-case endings such as '.log', and a function to open files with"
+        )
+
+
+def library(module: str, extra: str = "logs") -> Any:
+    """Return a module of a library that an extra installs.
+
+    Raises
+    ------
+    MissingExtraError
+        When it is not installed.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        package = module.partition(".")[0]
+        if isinstance(error, ModuleNotFoundError) and (error.name or "").startswith(package):
+            advice = f"pip install 'oodd-eval[{extra}]'"
+            raise MissingExtraError(f"these logs need {package}: {advice}") from None
+        raise
+
+
+@contextlib.contextmanager
+def readable(source: object) -> Iterator[None]:
+    """Raise `TrajectoryError`, with the source, for whatever a library raises in the block."""
+    try:
+        yield
+    except OoddError:
+        raise
+    except Exception as error:
+        raise unreadable(source, error) from error
+
+
+def unreadable(source: object, error: BaseException) -> TrajectoryError:
+    """Return the error for a file that a library cannot read."""
+    said = " ".join(str(error).split())[:300]
+    if isinstance(error, UnicodeDecodeError):
+        said += "; if it is text, [read] encoding = 'cp1252', or another, may be that of the file"
+    return TrajectoryError(f"{source} cannot be read: {type(error).__name__}: {said}")
+
+
+def in_order(name: str) -> list[Any]:
+    """Return what sorts ``episode_10`` behind ``episode_9``."""
+    return [(1, int(p), "") if p.isdigit() else (0, 0, p) for p in re.split(r"([0-9]+)", name)]
+
+
+def quantity(text: str) -> Quantity:
+    """Return the name and the unit of a column such as ``"pressure[bar]"``; no unit is 1.
+
+    >>> quantity("pressure[bar]").row, quantity("switch").row
+    ({'name': 'pressure', 'unit': 'bar'}, {'name': 'switch', 'unit': '1'})
+    """
+    match = re.fullmatch(r"\s*([^\[\]]*[^\[\]\s])\s*(?:\[([^\[\]]+)\])?\s*", text)
+    if not match or not text.isprintable():
+        raise UsageError(f"{text!r} is no name of a column, expected one such as 'pressure[bar]'")
+    return Quantity(match[1], match[2] or "1")
+
+
+def is_transposed(path: Path, options: Options) -> bool:
+    """Tell whether a recipe says that rows and columns of a file are exchanged.
+
+    The option ``transpose`` is true, or a list of globs over the names of files.
+    """
+    value = options.get("transpose", False)
+    if isinstance(value, bool):
+        return value
+    if isinstance(value, list) and all(isinstance(glob, str) for glob in value):
+        return any(fnmatch.fnmatch(path.name, glob) or path.match(glob) for glob in value)
+    raise UsageError(f"transpose is {value!r}, expected true, false or a list of globs")
+
+
+def chosen(names: Iterable[str], options: Options, option: str = "topics") -> list[str]:
+    """Return the names that an option selects, a glob or a list of globs; all without it.
+
+    Raises
+    ------
+    UsageError
+        When a glob fits none.
+    """
+    known, globs = [*names], options.get(option)
+    if globs is None:
+        return known
+    globs = [globs] if isinstance(globs, str) else globs
+    if not isinstance(globs, list) or not all(isinstance(glob, str) for glob in globs):
+        raise UsageError(f"{option}={globs!r:.80}, expected a list of globs")
+    for glob in globs:
+        if not fnmatch.filter(known, glob):
+            raise UnknownNameError(option.removesuffix("s"), glob, known)
+    return [name for name in known if any(fnmatch.fnmatch(name, glob) for glob in globs)]
+
+
+def _guarded(topic: Topic, recording: Recording) -> Topic:
+    def read(names: Sequence[str], start: int, stop: int) -> dict[str, Column]:
+        check_known(f"column of {recording.source}", topic.names, *names)
+        if not names:
+            return {}
+        with readable(recording.source):
+            return topic.read(names, max(0, start), min(stop, topic.rows))
+
+    return dataclasses.replace(topic, read=read)
+
+
+@functools.cache
+def _ours() -> dict[str, Reader]:
+    modules = [
+        importlib.import_module(m.name) for m in pkgutil.iter_modules(__path__, f"{__name__}.")
+    ]
+    return {module.READER.name: module.READER for module in modules if hasattr(module, "READER")}
+
+
+_registered: Final[dict[str, Reader]] = {}

@@ -1,0 +1,140 @@
+"""Cells of text: numbers, truth values, what is missing, and names of columns."""
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from typing import Final
+
+import numpy as np
+
+from oodd_eval.data.bounded import EPISODE
+from oodd_eval.errors import TrajectoryError
+from oodd_eval.names import is_plain
+from oodd_logs.recording import MISSING, Column
+
+_TRUTHS: Final = {"true": 1.0, "false": 0.0}
+_KINDS: Final = {
+    "obs": "obs",
+    "observation": "obs",
+    "observations": "obs",
+    "action": "action",
+    "actions": "action",
+    "reward": "reward",
+    "rewards": "reward",
+}
+
+
+def number(cell: str, decimal: str = ".") -> float:
+    """Return the number in a cell, 1 or 0 of a truth value, NaN where it says that none is there.
+
+    A point is no number's where decimals follow a comma: it may stand between thousands.
+
+    Raises
+    ------
+    ValueError
+        When it holds something else.
+    """
+    if decimal == ",":
+        if "." in cell:
+            raise ValueError(cell)
+        cell = cell.replace(decimal, ".")
+    try:
+        value = float(cell)
+    except ValueError:
+        word = cell.strip().lower()
+        if word in MISSING:
+            return np.nan
+        if word in _TRUTHS:
+            return _TRUTHS[word]
+        raise
+    if not is_plain(cell):
+        raise ValueError(cell)
+    return value
+
+
+def numbers(cells: Sequence[str], decimal: str = ".") -> Column | None:
+    """Return the numbers of a column; None where a cell holds something else.
+
+    Parameters
+    ----------
+    cells
+        Cells of the column.
+    decimal
+        What stands before the decimals: a point, a comma, or, for empty, either in all cells.
+    """
+    if not decimal:
+        column = numbers(cells, ".")
+        return numbers(cells, ",") if column is None else column
+    try:
+        if decimal == ".":  # the quick way for numbers alone
+            column = np.array([*map(float, cells)], np.float64)
+            return column if all(map(is_plain, cells)) else None
+    except ValueError:
+        pass
+    try:
+        values = {cell: number(cell, decimal) for cell in {*cells}}
+    except ValueError:
+        return None
+    return np.fromiter(map(values.__getitem__, cells), np.float64, len(cells))
+
+
+def first_text(cells: Sequence[str]) -> int:
+    """Return the position of the first cell that is no number; 0 where all are."""
+    return next((i for i, cell in enumerate(cells) if numbers([cell]) is None), 0)
+
+
+def texts(cells: Sequence[str], what: str) -> Column:
+    """Return a column of texts; `TrajectoryError` where it would take too much memory."""
+    stripped = [cell.strip() for cell in cells]
+    size = 4 * max(map(len, stripped), default=0) * len(stripped)
+    if size > EPISODE.most:
+        raise TrajectoryError(f"{what}: texts take {size} bytes, limit {EPISODE.most}")
+    return np.array(stripped, dtype=np.str_)
+
+
+def conventional(name: str) -> str:
+    """Return a column's name in the spelling of ``obs:NAME``, ``action:NAME`` and ``reward``.
+
+    Other cases, blanks and plurals are taken for these; a name that is no such name comes back as
+    it is.
+
+    >>> conventional("Obs: flow[l/s]"), conventional("actions:u"), conventional("obs_x")
+    ('obs:flow[l/s]', 'action:u', 'obs_x')
+    """
+    kind, colon, inner = name.partition(":")
+    known = _KINDS.get(kind.strip().lower())
+    if known == "reward" and not colon:
+        return known
+    return f"{known}:{inner.strip()}" if known in {"obs", "action"} and inner.strip() else name
+
+
+def nearest_spelling(name: str) -> str:
+    """Return what a name such as ``obs_x`` or ``action-u`` should be spelled as; empty for others.
+
+    >>> nearest_spelling("obs_x"), nearest_spelling("Actions.u"), nearest_spelling("flow")
+    ('obs:x', 'action:u', '')
+    """
+    match = re.fullmatch(r"(obs|observations?|actions?)[ _./-]+(.*\S)", name.strip(), re.IGNORECASE)
+    return f"{_KINDS[match[1].lower()]}:{match[2]}" if match else ""
+
+
+def column_names(names: Iterable[str]) -> tuple[str, ...]:
+    """Return names of columns without blanks around them, each once.
+
+    A second column of one name gets a number, and one without a name its position.
+
+    >>> column_names(["t", " x", "x", ""])
+    ('t', 'x', 'x (2)', 'column 4')
+    """
+    plain = [" ".join(name.split()) or f"column {i}" for i, name in enumerate(names, start=1)]
+    plain = [conventional(name) for name in plain]
+    counts: Counter[str] = Counter()
+    taken, unique = {*plain}, []
+    for name in plain:
+        counts[name] += 1
+        label = name
+        while counts[name] > 1 and (label := f"{name} ({counts[name]})") in taken:
+            counts[name] += 1
+        taken.add(label)
+        unique.append(label)
+    return tuple(unique)

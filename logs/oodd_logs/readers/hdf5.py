@@ -1,0 +1,127 @@
+"""Episodes in HDF5 files: a group an episode, or the datasets of the file itself."""
+
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oodd_eval.data.bounded import EPISODE
+from oodd_eval.data.facts import Quantity
+from oodd_eval.data.stored import StoredFile
+from oodd_eval.errors import TrajectoryError
+from oodd_logs.readers import TRANSPOSE, Options, Reader, in_order, is_transposed, unreadable
+from oodd_logs.readers.matrices import MatrixRows, episode_of, whole_number
+from oodd_logs.recording import Recording
+
+_DEEPEST: Final = 6  # levels of groups
+_LONGEST: Final = 1000  # characters of a text among the fields; simulators keep their model there
+_LEFT_OUT: Final = ("next_obs", "next_observations", "infos", "truncations")
+
+
+def read_groups(
+    path: Path,
+    *,
+    sensors: Sequence[Quantity] = (),
+    actions: Sequence[Quantity] = (),
+    further: Mapping[str, Any] | None = None,
+    transposed: bool = False,
+) -> Iterator[Recording]:
+    """Yield the episodes of a file, in the order of their names.
+
+    Parameters
+    ----------
+    path
+        The file.
+    sensors, actions
+        Names and units of the columns of observations and actions, where they are known.
+    further
+        Fields of every episode.
+    transposed
+        Whether rows and columns of matrices are exchanged.
+    """
+    file = StoredFile(path, EPISODE)  # the recordings hold it: their rows are read later
+    groups = _episodes(file, "/", 0)
+    if not groups:
+        raise TrajectoryError(f"{path} holds no dataset with rows")
+    for group in groups:
+        source = str(path) if group == "/" else f"{path}, group {group.strip('/')}"
+        fields = _fields(file, group, source)
+        arrays: dict[str, MatrixRows] = dict(_arrays(file, group, "", 0))
+        if "terminations" in arrays:
+            fields["terminated"] = bool(np.any(arrays.pop("terminations")[:]))
+        if transposed:
+            arrays = {k: _Transposed(a) if len(a.shape) == 2 else a for k, a in arrays.items()}
+        topic, single = episode_of(arrays, source, sensors, actions)
+        name = path.stem if group == "/" else group.rpartition("/")[2]
+        yield Recording(name, source, {"": topic}, {**single, **fields, **(further or {})})
+
+
+class _Transposed:
+    """A dataset whose columns are rows."""
+
+    def __init__(self, rows: MatrixRows) -> None:
+        self._rows, self.shape, self.dtype = rows, rows.shape[::-1], rows.dtype
+
+    def __getitem__(self, rows: Any, /) -> NDArray[Any]:
+        size = self.dtype.itemsize * math.prod(self.shape)
+        EPISODE.check("a transposed dataset", self.dtype, size)
+        columns: NDArray[Any] = self._rows[:].T[rows]
+        return columns
+
+
+def _episodes(file: StoredFile, group: str, depth: int) -> list[str]:
+    """Return the groups that are episodes: the outermost ones with a dataset of several rows."""
+    members = file.members(group)
+    if any(rows is not None and rows.shape and rows.shape[0] > 1 for rows in members.values()):
+        return [group]
+    if depth == _DEEPEST:
+        return []
+    names = sorted((name for name, rows in members.items() if rows is None), key=in_order)
+    return [e for n in names for e in _episodes(file, f"{group.rstrip('/')}/{n}", depth + 1)]
+
+
+def _arrays(
+    file: StoredFile, group: str, prefix: str, depth: int
+) -> Iterator[tuple[str, MatrixRows]]:
+    """Yield the arrays below a group by their names relative to the episode.
+
+    Left out are those that repeat others, shifted by a row, and texts.
+    """
+    for name, rows in file.members(group).items():
+        if name in _LEFT_OUT:
+            continue
+        if rows is not None and not rows.dtype.hasobject:
+            yield f"{prefix}{name}", rows
+        elif rows is None and depth < _DEEPEST:
+            inner = f"{group.rstrip('/')}/{name}"
+            yield from _arrays(file, inner, f"{prefix}{name}/", depth + 1)
+
+
+def _fields(file: StoredFile, group: str, source: str) -> dict[str, Any]:
+    named = file.attributes(group, ("onset", "seed", "parameters"))
+    fields = {
+        key: value
+        for key, value in file.single_values(group).items()
+        if not isinstance(value, str) or len(value) <= _LONGEST
+    }
+    for name in ("onset", "seed"):
+        if name in named:
+            fields[name] = whole_number(source, name, named[name])
+    if "parameters" in named:
+        try:
+            parameters = json.loads(named["parameters"])
+        except (TypeError, ValueError, RecursionError) as error:
+            raise unreadable(f"{source}, attribute parameters,", error) from error
+        fields["parameters"] = parameters if isinstance(parameters, dict) else {}
+    return fields
+
+
+def _open(path: Path, options: Options) -> Iterator[Recording]:
+    return read_groups(path, transposed=is_transposed(path, options))
+
+
+READER: Final = Reader("hdf5", "an HDF5 file", (".h5", ".hdf5", ".hdf"), _open, options=TRANSPOSE)

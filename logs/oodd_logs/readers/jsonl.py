@@ -1,0 +1,81 @@
+"""Recordings as lines of JSON, packed by gzip or not: an object an episode, or an object a row."""
+
+import gzip
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Final, cast
+
+import numpy as np
+
+from oodd_eval.data.bounded import EPISODE
+from oodd_eval.errors import TrajectoryError
+from oodd_logs.readers import Options, Reader, unreadable
+from oodd_logs.readers.gathered import Gathered, flat
+from oodd_logs.readers.matrices import MatrixRows, episode_of
+from oodd_logs.recording import Recording, Topic
+
+_LINE: Final = EPISODE.most // 4  # bytes
+
+
+def _open(path: Path, _options: Options) -> Iterator[Recording]:
+    name = path.name.removesuffix(".gz").rpartition(".")[0] or path.name
+    rows = Gathered(str(path))
+    for i, (line, value) in enumerate(_objects(path)):
+        source = f"{path}, line {line}"
+        if not rows.rows and (episode := _episode(value, source)):
+            topic, fields = episode
+            yield Recording(f"{name}-{i}", source, {"": topic}, fields)
+        elif i and not rows.rows:
+            raise TrajectoryError(f"{source} has no list of steps, as the lines above it have")
+        else:
+            rows.add(dict(flat(value)))
+    if rows.rows:
+        yield Recording(name, str(path), {"": rows.topic()})
+
+
+def _objects(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Yield the objects of a file with the numbers of their lines."""
+    with path.open("rb") as raw:
+        packed = raw.read(2) == b"\x1f\x8b"
+        raw.seek(0)
+        file = gzip.GzipFile(fileobj=raw) if packed else raw
+        for number, line in enumerate(iter(lambda: file.readline(_LINE + 1), b""), start=1):
+            if len(line) > _LINE:
+                raise EPISODE.failure(f"{path}, line {number} has more than {_LINE} bytes")
+            if not line.strip():
+                continue
+            try:
+                value = json.loads(line)
+            except (ValueError, RecursionError) as error:
+                raise unreadable(f"{path}, line {number}", error) from error
+            if not isinstance(value, dict):
+                raise TrajectoryError(
+                    f"{path}, line {number} holds {value!r:.80}, expected an object"
+                )
+            yield number, value
+
+
+def _episode(value: Mapping[str, Any], source: str) -> tuple[Topic, dict[str, Any]] | None:
+    """Return the rows and the fields of an object that is an episode; None for one that is a row.
+
+    An episode has a list of objects, one a step, or lists of rows of numbers.
+    """
+    steps = [k for k, v in value.items() if isinstance(v, list) and v and isinstance(v[0], dict)]
+    if len(steps) == 1:
+        rows = Gathered(source)
+        for step in value[steps[0]]:
+            if not isinstance(step, dict):
+                raise TrajectoryError(f"{source}: a step is {step!r:.80}, expected an object")
+            rows.add(dict(flat(step)))
+        return rows.topic(), {k: v for k, v in value.items() if k != steps[0]}
+    if any(isinstance(v, list) and v and isinstance(v[0], list) for v in value.values()):
+        arrays = {k: np.asarray(v) for k, v in value.items() if isinstance(v, list)}
+        topic, fields = episode_of(cast("Mapping[str, MatrixRows]", arrays), source)
+        return topic, {k: v for k, v in value.items() if not isinstance(v, list)} | fields
+    return None
+
+
+READER: Final = Reader(
+    "jsonl", "a file with a JSON object a line", (".jsonl", ".jsonl.gz", ".ndjson"), _open
+)

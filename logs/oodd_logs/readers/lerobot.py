@@ -1,0 +1,221 @@
+"""Data sets of LeRobot, versions 2 and 3: episodes in Parquet files, their facts beside them.
+
+Observations and actions have as many rows: what the last action led to was not recorded, so that it
+counts as missing.
+"""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from oodd_eval.data.bounded import EPISODE, read_bytes, read_json
+from oodd_eval.errors import TrajectoryError
+from oodd_eval.names import natural
+from oodd_logs.readers import Options, Reader, in_order, library, unreadable
+from oodd_logs.readers.cells import column_names
+from oodd_logs.readers.parquet import ParquetRows
+from oodd_logs.recording import Column, Recording, Topic
+
+_TIME: Final = "timestamp"
+_COUNTERS: Final = ("episode_index", "index", "task_index", "frame_index")
+
+_DATA_PATH: Final = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+
+Facts = Mapping[str, Any]
+
+
+def _open(directory: Path, _options: Options) -> Iterator[Recording]:
+    info = next((directory / p for p in READER.directory_markers if (directory / p).exists()), None)
+    if info is None:
+        raise TrajectoryError(f"{directory} has no meta/info.json, expected {READER.part}")
+    facts = _object(read_json(info, EPISODE.most, TrajectoryError), info)
+    fps = facts.get("fps")
+    if not isinstance(fps, int | float) or not 0 < fps < 1e9:
+        raise TrajectoryError(f"{info}: fps is {fps!r}, expected rows a second")
+    episodes = sorted(directory.glob("meta/episodes/**/*.parquet"))
+    if episodes:
+        yield from _version_3(directory, facts, episodes)
+        return
+    files = [
+        *directory.glob("data/chunk-*/episode_*.parquet"),
+        *directory.glob("episode_*.parquet"),
+    ]
+    tasks = _lines(info.with_name("tasks.jsonl"), "task_index")
+    known = _lines(info.with_name("episodes.jsonl"), "episode_index")
+    for path in sorted(files, key=lambda path: in_order(path.stem)):
+        rows = ParquetRows(path)
+        number = path.stem.removeprefix("episode_")
+        more = known.get(natural(number), {})
+        yield _episode(path.stem, str(path), rows, (0, rows.rows), facts, tasks, more)
+
+
+def _version_3(directory: Path, facts: Facts, episodes: Sequence[Path]) -> Iterator[Recording]:
+    """Yield episodes of files that hold several each; the table of episodes says where."""
+    tasks = _tasks(directory / "meta" / "tasks.parquet")
+    pattern = str(facts.get("data_path", _DATA_PATH))
+    files: dict[tuple[int, int], tuple[ParquetRows, int]] = {}
+    for table in episodes:
+        for entry in _entries(table):
+            try:
+                key = int(entry["data/chunk_index"]), int(entry["data/file_index"])
+                low, high = int(entry["dataset_from_index"]), int(entry["dataset_to_index"])
+                number = int(entry["episode_index"])
+                relative = pattern.format(chunk_index=key[0], file_index=key[1])
+            except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+                raise unreadable(table, error) from error
+            path = directory / relative
+            if not path.resolve().is_relative_to(directory.resolve()):
+                raise TrajectoryError(f"{table}: {relative!r} is outside the data set")
+            if key not in files:
+                rows = ParquetRows(path)
+                # Rows are numbered through all files.
+                files = {key: (rows, int(rows.read(["index"], 0, 1)["index"][0]))}
+            rows, first = files[key]
+            start, stop = low - first, high - first
+            if not 0 <= start < stop <= rows.rows:
+                raise TrajectoryError(
+                    f"{table}: episode {number} is rows {start} to {stop} of {path}, which has "
+                    f"{rows.rows}"
+                )
+            source = f"{path}, episode {number}"
+            name = f"episode_{number:06d}"
+            yield _episode(name, source, rows, (start, stop), facts, tasks, entry)
+
+
+def _episode(
+    name: str,
+    source: str,
+    rows: ParquetRows,
+    span: tuple[int, int],
+    facts: Facts,
+    tasks: Mapping[int, Facts],
+    more: Facts,
+) -> Recording:
+    """Return an episode; `span` is its rows in the file."""
+    columns = _columns(rows.names, facts, source)
+    first, count = span[0], span[1] - span[0]
+    fields: dict[str, Any] = {}
+    head = rows.read([n for n in rows.names if n in _COUNTERS], first, first + bool(count))
+    for counter in ("episode_index", "task_index"):
+        if counter in head and count:
+            fields[counter] = int(head[counter][0])
+    task = tasks.get(fields.get("task_index", -1), {}).get("task") or more.get("tasks")
+    if isinstance(task, list | tuple):
+        task = task[0] if len(task) == 1 else None
+    if isinstance(task, str):
+        fields["task"] = task
+    success = next((c for c in ("next.success", "success", "is_success") if c in rows.names), None)
+    if success and count:
+        fields["success"] = bool(np.nanmax(rows.read([success], first, span[1])[success]) > 0)
+    names = tuple(columns)
+    time = next((label for label, inner in columns.items() if inner == _TIME), "")
+    if not time:
+        time, names = "time", (*names, "time")
+
+    def read(labels: Sequence[str], start: int, stop: int) -> dict[str, Column]:
+        inner = [columns[label] for label in labels if label in columns]
+        cells = rows.read(inner, first + start, first + stop) if inner else {}
+        table = {label: cells[columns[label]] for label in labels if label in columns}
+        if "time" in labels and "time" not in columns:
+            table["time"] = np.arange(start, stop) / float(facts["fps"])
+        if stop == count:
+            for label in table:
+                if label.startswith("action:") or label == "reward":
+                    table[label] = np.append(table[label][:-1], np.nan)
+        return {label: table[label] for label in labels}
+
+    return Recording(name, source, {"": Topic(names, count, read, time)}, fields)
+
+
+def _columns(names: Sequence[str], facts: Facts, source: str) -> dict[str, str]:
+    """Return the columns of the files by the names that the data set has for them."""
+    features = facts.get("features")
+    if not isinstance(features, dict):
+        raise TrajectoryError(f"{source}: features are {features!r:.80}, expected a table")
+    labels: dict[str, str] = {}
+    for name in names:
+        feature, _, item = name.rpartition(".")
+        if feature not in features or natural(item) < 0 or name in features:
+            feature, item = name, ""
+        if feature in _COUNTERS:
+            continue
+        items = _flat(features.get(feature, {}).get("names")) if feature in features else []
+        position = int(item) if item else 0
+        inner = items[position] if position < len(items) and (item or len(items) == 1) else item
+        labels[name] = _label(feature, str(inner))
+    return dict(zip(column_names(labels.values()), labels, strict=True))
+
+
+def _label(feature: str, item: str) -> str:
+    """Return the name of a column: ``obs:NAME`` and ``action:NAME`` for the usual features."""
+    if feature in {"reward", "next.reward"}:
+        return "reward"
+    head, _, rest = feature.partition(".")
+    if head not in {"observation", "action"}:
+        return f"{feature}.{item}" if item else feature
+    kind = "obs" if head == "observation" else head
+    if rest in {"", "state"}:
+        return (
+            f"{kind}:{rest or head}.{item}" if item.isdigit() else f"{kind}:{item or rest or head}"
+        )
+    return f"{kind}:{rest}.{item}" if item else f"{kind}:{rest}"
+
+
+def _flat(names: Any) -> list[str]:
+    """Return names that may be a list, a list of lists, or lists by their kind."""
+    if isinstance(names, dict):
+        names = [*names.values()]
+    if isinstance(names, list):
+        return [text for inner in names for text in _flat(inner)]
+    return [] if names is None else [str(names)]
+
+
+def _object(value: Any, path: Path) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise TrajectoryError(f"{path} holds {value!r:.80}, expected a JSON object")
+    return value
+
+
+def _lines(path: Path, key: str) -> dict[int, Facts]:
+    """Return the objects of a file with one a line, by one of their numbers; none without it."""
+    if not path.exists():
+        return {}
+    lines = read_bytes(path, EPISODE.most, TrajectoryError).splitlines()
+    rows = [_object(json.loads(line), path) for line in lines if line.strip()]
+    return {row[key]: row for row in rows if isinstance(row.get(key), int)}
+
+
+def _entries(path: Path) -> list[dict[str, Any]]:
+    """Return the rows of a table of episodes, without the statistics of their columns."""
+    parquet = library("pyarrow.parquet")
+    with parquet.ParquetFile(path) as file:
+        names = [n for n in file.schema_arrow.names if not n.startswith(("stats/", "videos/"))]
+        if file.metadata.num_rows > EPISODE.most // 1000:
+            raise EPISODE.failure(f"{path} has {file.metadata.num_rows} episodes")
+        rows: list[dict[str, Any]] = file.read(columns=names).to_pylist()
+    return rows
+
+
+def _tasks(path: Path) -> dict[int, Facts]:
+    """Return the tasks of version 3, whose text is a column or the table's index."""
+    if not path.exists():
+        return {}
+    tasks: dict[int, Facts] = {}
+    for row in _entries(path):
+        text = next((row[k] for k in ("task", "__index_level_0__") if k in row), None)
+        if isinstance(row.get("task_index"), int):
+            tasks[row["task_index"]] = {"task": text}
+    return tasks
+
+
+READER: Final = Reader(
+    "lerobot",
+    "the directory of a LeRobot data set",
+    (),
+    _open,
+    extra="logs",
+    directory_markers=("meta/info.json", "info.json"),
+)

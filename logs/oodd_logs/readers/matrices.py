@@ -1,0 +1,165 @@
+"""Episodes as arrays with a row a step: what formats that name arrays have in common."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oodd_eval.data.bounded import EPISODE
+from oodd_eval.data.facts import Quantity
+from oodd_eval.errors import TrajectoryError
+from oodd_logs.readers.cells import column_names
+from oodd_logs.recording import Column, Topic
+
+_OBSERVATIONS: Final = ("observations", "observation", "obs")
+_ACTIONS: Final = ("actions", "action")
+_REWARDS: Final = ("rewards", "reward")
+_KINDS: Final = "fiub"
+_LONGEST_FIELD: Final = 1000  # items
+
+
+class MatrixRows(Protocol):
+    """MatrixRows that are read when asked for: an array, or a dataset in a file."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Number of rows, and of columns."""
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Kind of the numbers."""
+
+    def __getitem__(self, rows: Any, /) -> NDArray[Any]:
+        """Return a range of rows."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """A column of an array."""
+
+    array: str
+    column: int | None
+
+
+def episode_of(
+    arrays: Mapping[str, MatrixRows],
+    source: str,
+    sensors: Sequence[Quantity] = (),
+    actions: Sequence[Quantity] = (),
+) -> tuple[Topic, dict[str, Any]]:
+    """Return the rows of an episode, and what holds for all of it.
+
+    Observations, actions and rewards are known by their usual names, ``obs/NAME`` among them; other
+    arrays of their length are columns under their names. Actions and rewards are those of
+    transitions: they lack the last row, and where they have it, what it led to was not recorded, so
+    that it counts as missing. What is no array of that length is a field.
+
+    Parameters
+    ----------
+    arrays
+        Arrays of numbers by name.
+    source
+        What messages call the episode.
+    sensors, actions
+        Names and units of the columns of observations and actions, where they are known.
+
+    Raises
+    ------
+    TrajectoryError
+        When there are no rows, or lengths differ.
+    """
+    names = {name: _kind(name) for name in arrays}
+    observed = {len_of(arrays[n]) for n, kind in names.items() if kind == "obs"}
+    if len(observed) > 1:
+        raise TrajectoryError(f"{source}: observations have {sorted(observed)} rows")
+    # Without observations it is a table: its length is the most frequent one, the longest of these.
+    lengths = [len_of(a) for a in arrays.values() if a.dtype.kind in _KINDS and len_of(a) > 1]
+    rows = (
+        observed.pop() if observed else max(lengths, key=lambda n: (lengths.count(n), n), default=0)
+    )
+    if not rows:
+        raise TrajectoryError(f"{source} holds {', '.join(arrays) or 'nothing'}, expected arrays "
+                              "with a row a step, such as observations")  # fmt: skip
+    parts: dict[str, _Part] = {}
+    fields: dict[str, Any] = {}
+    for name, array in arrays.items():
+        kind, length = names[name], len_of(array)
+        fits = length in {rows, rows - 1} and len(array.shape) in {1, 2}
+        if not fits and kind:
+            raise TrajectoryError(
+                f"{source}: {name} has shape {array.shape}, expected {rows} or {rows - 1} rows, "
+                "and one number or a row of numbers in each"
+            )
+        if not fits or array.dtype.kind not in _KINDS:
+            if len(array.shape) < 2 and (not array.shape or length <= _LONGEST_FIELD):
+                values = np.asarray(array[:] if array.shape else array[()])
+                fields[name] = values.item() if values.size == 1 else values.tolist()
+            continue
+        known = {"obs": sensors, "action": actions}.get(kind, ())
+        width = array.shape[1] if len(array.shape) == 2 else None
+        for i in range(1 if width is None else width):
+            parts[_label(name, kind, i, width, known)] = _Part(name, None if width is None else i)
+    labels = dict(zip(column_names(parts), parts.values(), strict=True))
+
+    def read(chosen: Sequence[str], start: int, stop: int) -> dict[str, Column]:
+        blocks = {}
+        for name in {labels[c].array for c in chosen}:
+            array = arrays[name]
+            size = array.dtype.itemsize * math.prod(array.shape[1:]) * (stop - start)
+            EPISODE.check(f"{source}, {name}", array.dtype, size)
+            blocks[name] = array[start:stop]
+        columns = {}
+        for label in chosen:
+            part = labels[label]
+            block = blocks[part.array]
+            column = np.asarray(block if part.column is None else block[:, part.column], np.float64)
+            if stop == rows and names[part.array] in {"action", "reward"}:
+                column = column[: rows - 1 - start]
+            columns[label] = np.append(column, np.full(stop - start - len(column), np.nan))
+        return columns
+
+    return Topic(tuple(labels), rows, read), fields
+
+
+def _kind(name: str) -> str:
+    head, _, rest = name.partition("/")
+    if head in _OBSERVATIONS:
+        return "obs"
+    if head in _ACTIONS:
+        return "action"
+    return "reward" if name in _REWARDS and not rest else ""
+
+
+def _label(name: str, kind: str, i: int, width: int | None, known: Sequence[Quantity]) -> str:
+    inner = name.partition("/")[2].replace("/", ".")
+    if kind == "reward":
+        return kind
+    if not kind:
+        plain = name.replace("/", ".")
+        return plain if width is None else f"{plain}.{i}"
+    if inner:
+        return f"{kind}:{inner}" if width is None else f"{kind}:{inner}.{i}"
+    if len(known) == (1 if width is None else width):
+        unit = "" if known[i].unit == "1" else f"[{known[i].unit}]"
+        return f"{kind}:{known[i].name}{unit}"
+    return f"{kind}:{'sensor' if kind == 'obs' else kind} {i}"
+
+
+def len_of(array: MatrixRows) -> int:
+    """Return the number of rows; 0 for a single value."""
+    return array.shape[0] if array.shape else 0
+
+
+def whole_number(source: str, name: str, value: Any) -> int | None:
+    """Return a number that a file gives as an array or scalar, if it does; one value, no text."""
+    if value is None:
+        return None
+    array = np.asarray(value)
+    if array.size == 1 and array.dtype.kind in "iuf" and float(array.item()).is_integer():
+        number = int(array.item())
+        if abs(number) < 2**63:
+            return number
+    raise TrajectoryError(f"{source}: {name} is {value!r:.80}, expected one whole number")

@@ -1,0 +1,40 @@
+"""Episodes as ``.npz`` files of named arrays, or an ``.npy`` file with one array."""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Final, cast
+
+import numpy as np
+
+from oodd_eval.data.bounded import EPISODE, Bounds, npy_header, read_npz
+from oodd_eval.errors import TrajectoryError
+from oodd_logs.readers import TRANSPOSE, Options, Reader, is_transposed
+from oodd_logs.readers.matrices import MatrixRows, episode_of, whole_number
+from oodd_logs.recording import Recording
+
+_BOUNDS: Final = Bounds(EPISODE.most, TrajectoryError, EPISODE.advice, kinds="fiubU")
+
+
+def _open(path: Path, options: Options) -> Iterator[Recording]:
+    arrays: dict[str, Any]
+    arrays = {"observations": _array(path)} if path.suffix == ".npy" else read_npz(path, _BOUNDS)
+    if is_transposed(path, options):
+        arrays = {name: a.T if a.ndim == 2 else a for name, a in arrays.items()}
+    topic, fields = episode_of(cast("Mapping[str, MatrixRows]", arrays), str(path))
+    for name in ("onset", "seed"):
+        if name in fields:
+            fields[name] = whole_number(str(path), name, fields[name])
+    yield Recording(path.stem, str(path), {"": topic}, fields)
+
+
+def _array(path: Path) -> Any:
+    """Return the array of an ``.npy`` file, whose rows are read when asked for."""
+    with path.open("rb") as file:
+        dtype, size = npy_header(file)
+        EPISODE.check(str(path), dtype, 0)
+        if size > path.stat().st_size - file.tell():
+            raise TrajectoryError(f"{path} announces {size} bytes of numbers and is shorter")
+    return np.load(path, mmap_mode="r" if size else None, allow_pickle=False)
+
+
+READER: Final = Reader("numpy", "a NumPy file", (".npz", ".npy"), _open, options=TRANSPOSE)

@@ -1,0 +1,210 @@
+"""Recordings as Parquet files, of which some thousand rows are in memory at a time."""
+
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from oodd_eval.data.bounded import EPISODE
+from oodd_eval.errors import TrajectoryError
+from oodd_logs.readers import Options, Reader, library
+from oodd_logs.readers.cells import column_names, texts
+from oodd_logs.recording import Column, Recording, Topic
+
+_BATCH: Final = 2**15  # rows
+_STREAMS: Final = 4  # choices of columns that are read in turns
+_WIDEST: Final = 4096  # numbers in one cell; images have more
+_PER_SECOND: Final = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
+
+
+@dataclass(frozen=True, slots=True)
+class _Leaf:
+    """One column of numbers or texts: where it is in a column of the file.
+
+    `path` has the fields of structures and positions in lists, as names and numbers.
+    """
+
+    column: str
+    path: tuple[str | int, ...]
+
+    @property
+    def label(self) -> str:
+        return ".".join(map(str, (self.column, *self.path)))
+
+
+class ParquetRows:
+    """Rows of a Parquet file, read on in batches as long as ranges follow one another.
+
+    Parameters
+    ----------
+    path
+        The file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with self._opened() as file:
+            metadata, schema = file.metadata, file.schema_arrow
+            self.rows: int = metadata.num_rows
+            groups = [metadata.row_group(i).num_rows for i in range(metadata.num_row_groups)]
+            lists = [f.name for f in schema if "list<" in str(f.type)]
+            first = next(file.iter_batches(batch_size=64, columns=lists), None) if lists else None
+        self._starts = np.cumsum([0, *groups])
+        leaves = [leaf for f in schema for leaf in _leaves(f.name, f.type, first, path)]
+        self._leaves = dict(zip(column_names(leaf.label for leaf in leaves), leaves, strict=True))
+        stamps = [f.name for f in schema if library("pyarrow").types.is_timestamp(f.type)]
+        self.time = stamps[0] if len(stamps) == 1 else ""
+        self._streams: dict[tuple[str, ...], _Stream] = {}
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the columns."""
+        return tuple(self._leaves)
+
+    def topic(self) -> Topic:
+        """Return all rows as a topic."""
+        return Topic(self.names, self.rows, self.read, self.time)
+
+    def read(self, names: Sequence[str], start: int, stop: int) -> dict[str, Column]:
+        """Return columns of a range of rows."""
+        key = tuple(names)
+        stream = self._streams.pop(key, None)
+        group = max(0, int(np.searchsorted(self._starts, start, side="right")) - 1)
+        first = int(self._starts[group])
+        if stream is None or start < stream.first or stream.end < first:
+            leaves = {name: self._leaves[name] for name in key}
+            stream = _Stream(self._batches(leaves, group), first)
+        parts = stream.take(start, stop)
+        if (rows := sum(len(part[key[0]]) for part in parts)) != stop - start:
+            raise TrajectoryError(f"{self.path} has {rows} of the rows {start} to {stop - 1}")
+        self._streams[key] = stream  # the last one used stands last
+        while len(self._streams) > _STREAMS:
+            self._streams.pop(next(iter(self._streams))).batches.close()
+        return {name: _joined([part[name] for part in parts], name, self.path) for name in names}
+
+    def _batches(self, leaves: Mapping[str, _Leaf], group: int) -> Generator[dict[str, Column]]:
+        columns = [*dict.fromkeys(leaf.column for leaf in leaves.values())]
+        with self._opened() as file:
+            groups = range(group, len(self._starts) - 1)
+            for batch in file.iter_batches(batch_size=_BATCH, row_groups=groups, columns=columns):
+                yield {
+                    name: _values(batch.column(leaf.column), leaf, self.path)
+                    for name, leaf in leaves.items()
+                }
+
+    def _opened(self) -> Any:
+        # By default the library keeps all that it has read of the file.
+        return library("pyarrow.parquet").ParquetFile(
+            self.path, pre_buffer=False, buffer_size=2**20
+        )
+
+
+@dataclass(slots=True)
+class _Stream:
+    """Batches in a row, of which those are kept that the next range may need."""
+
+    batches: Generator[dict[str, Column]]
+    first: int
+    kept: list[dict[str, Column]] = field(default_factory=list)
+
+    def take(self, start: int, stop: int) -> list[dict[str, Column]]:
+        """Return the rows of a range in pieces; what lies before it is forgotten."""
+        while True:
+            while self.kept and self.first + _count(self.kept[0]) <= start:
+                self.first += _count(self.kept.pop(0))
+            if self.end >= stop or (batch := next(self.batches, None)) is None:
+                break
+            self.kept.append(batch)
+        pieces, low = [], self.first
+        for batch in self.kept:
+            rows = slice(max(0, start - low), max(0, stop - low))
+            pieces.append({name: column[rows] for name, column in batch.items()})
+            low += _count(batch)
+        return pieces
+
+    @property
+    def end(self) -> int:
+        """Row after the last one that is in memory."""
+        return self.first + sum(map(_count, self.kept))
+
+
+def _count(batch: Mapping[str, Column]) -> int:
+    return len(next(iter(batch.values()), ()))
+
+
+def _leaves(column: str, kind: Any, first: Any, path: Path) -> list[_Leaf]:
+    """Return the columns in one of the file: fields of structures, items of lists.
+
+    Lists have as many items as their type says, or those of the first row with any.
+    """
+    value = None
+    if first is not None and column in first.schema.names:
+        value = next((cell.as_py() for cell in first.column(column) if cell.is_valid), None)
+
+    def inner(kind: Any, value: Any, steps: tuple[str | int, ...]) -> Iterator[_Leaf]:
+        types = library("pyarrow").types
+        if len(steps) > 16:
+            raise TrajectoryError(f"{path}, column {column!r}: more than 16 levels of structure")
+        if types.is_struct(kind):
+            for f in kind:
+                yield from inner(f.type, (value or {}).get(f.name), (*steps, f.name))
+        elif types.is_fixed_size_list(kind) or types.is_list(kind) or types.is_large_list(kind):
+            size = kind.list_size if types.is_fixed_size_list(kind) else len(value or ())
+            if size <= _WIDEST:
+                items = value or [None] * size
+                for i in range(size):
+                    yield from inner(kind.value_type, items[i], (*steps, i))
+        elif not (types.is_binary(kind) or types.is_large_binary(kind) or types.is_map(kind)):
+            yield _Leaf(column, steps)
+
+    return [*inner(kind, value, ())]
+
+
+def _values(array: Any, leaf: _Leaf, path: Path) -> Column:
+    """Return the numbers or texts of a column in a batch."""
+    pa, compute = library("pyarrow"), library("pyarrow.compute")
+    types = pa.types
+    for step in leaf.path:
+        if isinstance(step, str):
+            array = compute.struct_field(array, step)
+        elif types.is_fixed_size_list(array.type):
+            array = compute.list_element(array, step)
+        else:
+            lengths = compute.list_value_length(array)
+            bounds = compute.min_max(lengths).as_py()
+            if bounds["min"] is not None and bounds["min"] <= step:
+                raise TrajectoryError(
+                    f"{path}, column {leaf.column!r}: lists have from {bounds['min']} to "
+                    f"{bounds['max']} items, expected as many as in the first row"
+                )
+            array = compute.list_element(array, step)
+    if types.is_dictionary(array.type):
+        array = array.dictionary_decode()
+    kind = array.type
+    worded = (types.is_string, types.is_large_string, types.is_date, types.is_time)
+    if kind == pa.string_view() or any(is_kind(kind) for is_kind in worded):
+        cells = ["" if cell is None else str(cell) for cell in array.to_pylist()]
+        return texts(cells, f"{path}, column {leaf.label!r}")
+    per_second = 1.0
+    if types.is_timestamp(kind) or types.is_duration(kind):
+        array, per_second = array.cast(pa.int64()), _PER_SECOND[kind.unit]
+    numbers = array.cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False)
+    return np.asarray(numbers) / per_second
+
+
+def _joined(parts: list[Column], name: str, path: Path) -> Column:
+    if not parts:
+        return np.empty(0)
+    size = sum(part.size for part in parts) * max(part.itemsize for part in parts)
+    if parts[0].dtype.kind == "U" and size > EPISODE.most:
+        raise TrajectoryError(f"{path}, column {name!r}: texts take {size} bytes")
+    return np.concatenate(parts) if len(parts) > 1 else parts[0]
+
+
+def _open(path: Path, _options: Options) -> Iterator[Recording]:
+    yield Recording(path.stem, str(path), {"": ParquetRows(path).topic()})
+
+
+READER: Final = Reader("parquet", "a Parquet file", (".parquet", ".pq"), _open, extra="logs")

@@ -1,0 +1,325 @@
+"""Facts of one recording by its recipe: values that hold for all of it, stamps, anomalous rows."""
+
+import dataclasses
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oodd_eval.data.parts import CALIBRATION, TRAIN, TWINS
+from oodd_eval.errors import TrajectoryError, UnknownNameError, UsageError
+from oodd_logs.marks import IntervalList, Mark, anomalous_cells, runs_of
+from oodd_logs.readers.cells import first_text
+from oodd_logs.recipe import Recipe, anomaly_name
+from oodd_logs.recording import Recording, Topic, parse_times
+from oodd_logs.rows import Tally, TopicRows, read_column
+from oodd_logs.selecting import Selection, find_columns, layout_of, named_columns
+from oodd_logs.stamps import (
+    Stretch,
+    Times,
+    check_stamps,
+    cut_at_gaps,
+    on_grid,
+    set_forward,
+    unit_of,
+)
+
+FILES: Final = "files"
+"""Role of the nominal files whose episodes are shared out."""
+
+NOMINAL_ROLES: Final = frozenset({FILES, TRAIN, CALIBRATION, TWINS})
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recorded:
+    """A recording, and what a recipe says that its file holds.
+
+    Parameters
+    ----------
+    recording
+        The recording.
+    path
+        Its file.
+    relative
+        The same below the folder of the recipe.
+    roles
+        What its file is listed as: ``"files"`` to be shared out, parts such as ``"train"``, and
+        ``"test/NAME"`` of anomalies.
+    """
+
+    recording: Recording
+    path: Path
+    relative: str
+    roles: frozenset[str]
+
+    @property
+    def source(self) -> str:
+        """Its name in messages."""
+        return self.recording.source
+
+    @property
+    def kinds(self) -> list[str]:
+        """Names of the anomalies among its roles."""
+        return sorted(role.removeprefix("test/") for role in self.roles - NOMINAL_ROLES)
+
+    def meeting(self, recipe: Recipe) -> "Recorded":
+        """Return it with those of its roles whose conditions its values meet."""
+        kept = set()
+        for role in self.roles:
+            if role in NOMINAL_ROLES:
+                conditions = dict(recipe.nominal.where)
+                conditions.pop(recipe.kinds, None)  # other values name anomalies
+            else:
+                conditions = dict(recipe.anomalous[role.removeprefix("test/")].where)
+            if all(self.text(k) in map(text_of, values) for k, values in conditions.items()):
+                kept.add(role)
+        return dataclasses.replace(self, roles=frozenset(kept))
+
+    def text(self, name: str, *, last: bool = False) -> str:
+        """Return the value of a field, or of a column: the only one, or that of the last row.
+
+        Raises
+        ------
+        UnknownNameError
+            When there is neither.
+        TrajectoryError
+            When the column has several values.
+        """
+        fields = {"file": self.path.stem, **self.recording.fields}
+        if name in fields:
+            return text_of(fields[name])
+        layout = layout_of(self.recording)
+        columns = find_columns(layout, name)
+        if not columns:
+            known = [*fields, *named_columns(layout)]
+            raise UnknownNameError(f"field or column of {self.source}", name, known)
+        topic, column = self.recording.topics[columns[0].topic], columns[0].column
+        if last:
+            cells = topic.read([column], topic.rows - 1, topic.rows)[column]
+            return text_of(cells[-1].item())
+        distinct: set[str] = set()
+        for _start, cells in read_column(topic, column):
+            distinct |= {*map(text_of, np.unique(cells).tolist()[:5])}
+        if len(distinct) != 1:
+            values = ", ".join(sorted(distinct)[:3]) or "no value"
+            raise TrajectoryError(
+                f"{self.source}: {name} is {values}, expected one value in a recording"
+            )
+        return distinct.pop()
+
+
+def text_of(value: Any) -> str:
+    """Return a value as text, the same for equal numbers and truth values of any type."""
+    if isinstance(value, bool | np.bool_):
+        return "1" if value else "0"
+    if isinstance(value, int | float | np.number) and float(value).is_integer():
+        return str(int(value))
+    text = str(value).strip()
+    return {"true": "1", "false": "0"}.get(text.lower(), text)
+
+
+class StampedRows:
+    """The chosen columns of a recording, the stretches of its rows, and which are anomalous.
+
+    Parameters
+    ----------
+    recorded
+        The recording.
+    selection
+        Its chosen columns.
+    recipe
+        Says at which rate and where to cut, and what is anomalous.
+    tally
+        Counts rows that are dropped.
+
+    Attributes
+    ----------
+    topics
+        Rows of the topics with chosen columns.
+
+    Raises
+    ------
+    TrajectoryError
+        When a cell is no stamp, or is missing and the recipe refuses that.
+    """
+
+    def __init__(
+        self, recorded: Recorded, selection: Selection, recipe: Recipe, tally: Tally
+    ) -> None:
+        self._recorded, self._selection = recorded, selection
+        self._recipe, self._tally = recipe, tally
+        self.topics = {
+            name: TopicRows(recorded.recording, name, selection, recipe, tally)
+            for name in selection.topics
+        }
+        is_timed = bool(recipe.time) or recipe.rate is not None
+        self._logged = {name: self._read(name) for name in (selection.times if is_timed else ())}
+        self._stamps = self._logged
+        if recipe.gap and len(self.topics) == 1:
+            self._stamps = {n: set_forward(times, recipe.gap) for n, times in self._logged.items()}
+
+    def _read(self, topic: str) -> Times:
+        """Return the stamps of a topic in seconds, NaN where a row has none."""
+        source, column = self._recorded.source, self._selection.times[topic]
+        blocks = [
+            _seconds(cells, column.quantity.unit, f"{source}, column {column.column!r}")
+            for _start, cells in read_column(self._recorded.recording.topics[topic], column.column)
+        ]
+        times = np.concatenate([np.empty(0), *blocks])
+        missing = ~np.isfinite(times)
+        if missing.any() and self._recipe.missing == "refuse":
+            raise TrajectoryError(
+                f"{source}, row {int(missing.argmax())} has no stamp: missing = 'drop' in the "
+                "recipe leaves such rows out"
+            )
+        self._tally.add("rows without a stamp dropped", int(missing.sum()), source)
+        return times
+
+    def stretches(self) -> tuple[list[Stretch], list[Times]]:
+        """Return the rows that become episodes, on an even grid or as they are, and their stamps.
+
+        Returns
+        -------
+        tuple
+            Stretches without gaps, and the stamps of each topic; none without stamps.
+
+        Raises
+        ------
+        UsageError
+            When topics cannot be joined.
+        TrajectoryError
+            When stamps are wrong, or there is a gap.
+        """
+        source, recipe = self._recorded.source, self._recipe
+        usable = {name: rows.usable() for name, rows in self.topics.items()}
+        is_timed = all(name in self._stamps for name in usable)
+        if len(usable) > 1 and (not is_timed or recipe.rate is None):
+            raise UsageError(
+                f"{source}: sensors are of the topics {', '.join(usable)}, whose rows are joined "
+                "by their stamps: name time, unless the format has it, and rate"
+            )
+        if not is_timed:
+            ((name, numbers),) = usable.items()
+            return [Stretch(len(numbers), usable, numbers)], []
+        timed = {}
+        for name, numbers in usable.items():
+            rows = numbers[np.isfinite(self._stamps[name][numbers])]
+            times = self._stamps[name][rows]
+            if recipe.missing == "keep":  # whatever is recorded is judged
+                rising = times > np.append(-np.inf, np.maximum.accumulate(times)[:-1])
+                self._tally.add("rows stamped before others dropped", int((~rising).sum()), source)
+                rows, times = rows[rising], times[rising]
+            if not len(rows):
+                of_topic = f" of topic {name!r}" if name else ""
+                raise TrajectoryError(f"{source} has no rows{of_topic}, expected some")
+            check_stamps(times, rows, source, resampled=recipe.rate is not None)
+            usable[name], timed[name] = rows, times
+        stretches, left_out = [], sum(map(len, timed.values()))
+        for first, last in cut_at_gaps(timed, recipe.gap, recipe.rate, source):
+            inside = {n: (times >= first) & (times <= last) for n, times in timed.items()}
+            left_out -= sum(int(rows.sum()) for rows in inside.values())
+            if recipe.rate is None:
+                ((name, chosen),) = inside.items()
+                rows = usable[name][chosen]
+                stretches.append(Stretch(len(rows), {name: rows}, timed[name][chosen]))
+            else:
+                stretch = on_grid(timed, first, last, recipe.rate, source)
+                sources = {n: usable[n][numbers] for n, numbers in stretch.sources.items()}
+                stretches.append(dataclasses.replace(stretch, sources=sources))
+        self._tally.add("rows left out where another topic has none", left_out, source)
+        return stretches, [*timed.values()]
+
+    def marks(self, intervals: IntervalList, *, is_anomalous: bool) -> list[Mark]:
+        """Return the anomalous rows, in seconds where there are stamps.
+
+        Parameters
+        ----------
+        intervals
+            Anomalous rows by file.
+        is_anomalous
+            Whether the recipe's onset holds for the recording.
+        """
+        recorded, recipe = self._recorded, self._recipe
+        marks = []
+        for text, column in self._selection.labels.items():
+            owners = [name for name, table in recipe.anomalous.items() if text in table.labels]
+            topic = recorded.recording.topics[column.topic]
+            marks += [
+                self._mark(start, stop, kind, column.topic)
+                for start, stop in _labelled(topic, column.column, recipe)
+                for kind in ([""] if text in recipe.labels else owners)
+            ]
+        for _, start, stop, kind in intervals.of_recording(
+            recorded.path, recorded.recording.name, recorded.relative
+        ):
+            marks.append(self._mark(start, stop, kind and anomaly_name(kind)))
+        tables = {name: recipe.anomalous[name] for name in recorded.kinds}
+        onsets = [(table.onset, table.stop, name) for name, table in tables.items()]
+        onset = recorded.recording.fields.get("onset")
+        if onset is None and is_anomalous:
+            onset = recipe.onset
+        for first, stop, kind in (*onsets, (onset, recipe.stop, "")):
+            if first is not None:
+                marks.append(self._mark(int(first), stop, kind))
+        return marks
+
+    def _mark(self, start: Any, stop: Any, kind: str, topic: str = "") -> Mark:
+        topic = topic or self._selection.topics[0]
+        begin = -np.inf if start is None else self._position(start, topic, "begin")
+        end = np.inf if stop is None else self._position(stop, topic, "end")
+        if not begin < end:
+            raise TrajectoryError(
+                f"{self._recorded.source}: an anomaly is from {start} to {stop}, expected an end "
+                "behind its start"
+            )
+        return Mark(begin, end, kind)
+
+    def _position(self, moment: float | str, topic: str, side: str) -> float:
+        """Return where a row or time is: in seconds, or rows without stamps."""
+        source, rows = self._recorded.source, self._recorded.recording.topics[topic].rows
+        stamps, most = self._stamps.get(topic), rows - (side == "begin")
+        if isinstance(moment, int):
+            if not 0 <= moment <= most:
+                raise TrajectoryError(
+                    f"{source}: an anomaly is said to {side} at row {moment}, expected 0 to "
+                    f"{most}, as there are {rows} rows"
+                )
+            if stamps is None:
+                return float(moment) if moment < rows else np.inf
+            later = stamps[moment:]
+            return float(next(iter(later[np.isfinite(later)]), np.inf))
+        if stamps is None:
+            raise UsageError(
+                f"{source}: {moment!r} is a time, but there are no stamps: name their column with "
+                "time, or name rows, which are whole numbers"
+            )
+        unit = self._selection.times[topic].quantity.unit
+        time = float(_seconds(np.array([moment]), unit, f"{source}: an anomaly")[0])
+        logged = self._logged[topic]
+        if logged is stamps:
+            return time
+        # Where the clock was set back, a time is that of the first rows that have it.
+        row = [*np.flatnonzero(logged >= time), np.flatnonzero(np.isfinite(logged))[-1]][0]
+        return float(stamps[row] + time - logged[row])
+
+
+def _seconds(cells: NDArray[Any], unit: str, source: str) -> Times:
+    row = first_text(cells.tolist()) if cells.dtype.kind == "U" else 0
+    if row and cells[0]:  # stamps that begin as numbers
+        raise TrajectoryError(f"{source}: row {row}: {str(cells[row])!r:.60}, expected a number")
+    try:
+        return parse_times(cells, "" if cells.dtype.kind == "U" else unit_of(unit))
+    except (TrajectoryError, UsageError) as error:
+        raise TrajectoryError(f"{source}: {error}") from None
+
+
+def _labelled(topic: Topic, column: str, recipe: Recipe) -> Iterable[tuple[int, int]]:
+    """Return the runs of anomalous rows by a column with labels."""
+    blocks: list[NDArray[np.bool_]] = []
+    for _start, cells in read_column(topic, column):
+        before = bool(blocks and blocks[-1][-1])
+        blocks.append(anomalous_cells(cells, recipe, before=before))
+    return runs_of(np.concatenate(blocks)) if blocks else []

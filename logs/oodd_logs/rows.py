@@ -1,0 +1,389 @@
+"""Rows of a recording for an episode: read in blocks, missing values held, angles unwrapped.
+
+Nothing here holds more than a block of a recording; what comes out is float64.
+"""
+
+import contextlib
+import math
+import tempfile
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oodd_eval.data.facts import Quantity
+from oodd_eval.errors import OutputError, TrajectoryError, UsageError
+from oodd_eval.names import counted
+from oodd_logs.readers.cells import first_text, numbers
+from oodd_logs.recipe import Recipe
+from oodd_logs.recording import Recording, Topic
+from oodd_logs.selecting import ChosenColumn, Selection, matches_any
+from oodd_logs.stamps import Stretch
+
+_CELLS: Final = 1 << 18  # that are read at once
+_MOST_CHOICES: Final = 64
+_MOST_ACTIONS: Final = 1000  # of discrete ones, each a column
+_FULL_TURN: Final = {"deg": 180.0, "°": 180.0, "degree": 180.0, "degrees": 180.0}
+
+Matrix = NDArray[np.float64]
+
+
+@dataclass(slots=True)
+class Tally:
+    """Counts of rows dropped and held while rows were read, for the message at the end."""
+
+    rows: Counter[str] = field(default_factory=Counter)
+    files: dict[str, set[str]] = field(default_factory=dict)
+
+    def add(self, what: str, rows: int, source: str) -> None:
+        """Count rows of a recording."""
+        if rows:
+            self.rows[what] += rows
+            self.files.setdefault(what, set()).add(source)
+
+    def lines(self) -> list[str]:
+        """Return a line for each thing that was counted."""
+        return [
+            f"{what}: {n} in {counted(len(self.files[what]), 'recording(s)')}"
+            for what, n in self.rows.items()
+        ]
+
+
+def read_column(topic: Topic, column: str) -> Iterator[tuple[int, NDArray[Any]]]:
+    """Yield the first row and the cells of blocks of a column."""
+    for start in range(0, topic.rows, _CELLS):
+        yield start, topic.read([column], start, min(start + _CELLS, topic.rows))[column]
+
+
+class TopicRows:
+    """The chosen columns of one topic, without missing values, read once from front to back.
+
+    Parameters
+    ----------
+    recording
+        What is read.
+    name
+        Of the topic.
+    selection
+        Chosen columns of the recording.
+    recipe
+        Says what missing values do.
+    tally
+        Counts what is held and dropped.
+    """
+
+    def __init__(
+        self, recording: Recording, name: str, selection: Selection, recipe: Recipe, tally: Tally
+    ) -> None:
+        self._topic, self._source = recording.topics[name], recording.source
+        rewards = (selection.reward,) if selection.reward else ()
+        columns = (*selection.sensors, *selection.actions, *rewards)
+        self.indices = [i for i, column in enumerate(columns) if column.topic == name]
+        self._columns = [columns[i].column for i in self.indices]
+        self._unique = list(dict.fromkeys(self._columns))
+        # What a last action led to was not recorded: it may be missing.
+        self._may_end = np.array([i >= len(selection.sensors) for i in self.indices], bool)
+        self._policy, self._most, self._tally = recipe.missing, recipe.missing_rows, tally
+        self._position = 0
+        self._last = np.full(len(self._columns), np.nan)
+        self._runs = np.zeros(len(self._columns), np.int64)
+        self._step = max(64, _CELLS // max(1, len(self._columns)))
+
+    @property
+    def count(self) -> int:
+        """Number of rows of the topic."""
+        return self._topic.rows
+
+    def usable(self) -> NDArray[np.int64]:
+        """Return the numbers of the rows that missing values leave.
+
+        Raises
+        ------
+        TrajectoryError
+            When more rows in a run are dropped than the recipe allows.
+        """
+        if self._policy == "refuse":
+            return np.arange(self.count)
+        firsts = np.full(len(self._columns), -1)
+        complete = np.zeros(self.count, bool)
+        for start in range(0, self.count, self._step):
+            present = np.isfinite(self._cells(start, min(start + self._step, self.count)))
+            now = (firsts < 0) & present.any(axis=0)
+            firsts[now] = start + present.argmax(axis=0)[now]
+            present[-1:] |= self._may_end & (start + len(present) == self.count)
+            complete[start : start + len(present)] = present.all(axis=1)
+            if self._policy != "drop" and firsts.min(initial=0) >= 0:
+                break
+        lacking = [name for name, row in zip(self._columns, firsts, strict=True) if row < 0]
+        if self._policy == "keep" and lacking:  # for the scan to say
+            return np.arange(self.count)
+        kept = np.flatnonzero(complete)
+        if lacking or (self._policy == "drop" and not len(kept)):
+            what = f"column {lacking[0]!r} has no value" if lacking else "no row has all values"
+            raise TrajectoryError(
+                f"{self._source}: {what}, expected some: leave the column or the file out"
+            )
+        if self._policy != "drop":
+            first = self._position = int(firsts.max(initial=0))
+            self._tally.add("leading rows with missing values dropped", first, self._source)
+            return np.arange(first, self.count)
+        dropped = np.diff(kept) - 1
+        if dropped.max(initial=0) > self._most:
+            row = int(kept[int(dropped.argmax())]) + 1
+            raise self._too_long(row, "", int(dropped.max()))
+        self._tally.add("rows with missing values dropped", self.count - len(kept), self._source)
+        return kept
+
+    def rows(self, numbers: NDArray[np.int64]) -> Matrix:
+        """Return rows by their numbers, which never fall, from one call to the next either.
+
+        Raises
+        ------
+        TrajectoryError
+            For text, and for missing values that the recipe refuses; the message names the row.
+        """
+        out = np.empty((len(numbers), len(self._columns)))
+        done = int(np.searchsorted(numbers, self._position))
+        out[:done] = self._last
+        end = int(numbers[-1]) + 1
+        if self._policy != "hold" and done < len(numbers):
+            self._position = int(numbers[done])  # rows between stay unread
+        while self._position < end:
+            start, stop = self._position, min(self._position + self._step, end)
+            cells = self._cells(start, stop)
+            self._fill_end(cells, stop)
+            if self._policy in {"refuse", "hold"}:
+                self._fill(cells, start)
+            upto = int(np.searchsorted(numbers, stop))
+            out[done:upto] = cells[numbers[done:upto] - start]
+            done, self._position = upto, stop
+            self._last = cells[-1].copy()
+        return out
+
+    def _fill_end(self, cells: Matrix, stop: int) -> None:
+        """Give actions and rewards that are missing in the last row of all the values before."""
+        if stop == self.count:
+            before = cells[-2] if len(cells) > 1 else self._last
+            ends = self._may_end & ~np.isfinite(cells[-1])
+            cells[-1, ends] = np.nan_to_num(before[ends])
+
+    def _fill(self, cells: Matrix, start: int) -> None:
+        """Replace missing values by the last ones, or refuse them."""
+        missing = ~np.isfinite(cells)
+        if not missing.any():
+            self._runs[:] = 0
+            return
+        for j in np.flatnonzero(missing.any(axis=0)).tolist():
+            bad, numbers = missing[:, j], np.arange(len(cells))
+            if self._policy == "refuse":
+                row = int(bad.argmax())
+                value = "missing" if math.isnan(cells[row, j]) else str(cells[row, j])
+                raise TrajectoryError(
+                    f"{self._source}, row {start + row}, column {self._columns[j]!r} is {value}, "
+                    "expected a finite number: missing = 'hold' or 'drop' in a recipe says what "
+                    "to do"
+                )
+            held = np.maximum.accumulate(np.where(bad, -1, numbers))
+            runs = np.where(held < 0, numbers + 1 + self._runs[j], numbers - held)
+            if runs.max() > self._most:
+                row, longest = start + int(runs.argmax()), int(runs.max())
+                raise self._too_long(row - longest + 1, self._columns[j], longest)
+            cells[:, j] = np.where(held < 0, self._last[j], cells[np.maximum(held, 0), j])
+            self._runs[j] = runs[-1]
+        self._runs[~missing[-1]] = 0
+        count = int(missing.any(axis=1).sum())
+        self._tally.add("rows with missing values held", count, self._source)
+
+    def _too_long(self, row: int, column: str, rows: int) -> TrajectoryError:
+        what = f"column {column!r} is missing" if column else "values are missing"
+        return TrajectoryError(
+            f"{self._source}, row {row}: {what} for at least {rows} rows, expected at most "
+            f"{self._most} in a run: a larger missing_rows allows it, else leave the column or the "
+            "file out"
+        )
+
+    def _cells(self, start: int, stop: int) -> Matrix:
+        cells = self._topic.read(self._unique, start, stop)
+        for name, values in cells.items():
+            if values.dtype.kind == "U":
+                raise _text_error(self._source, name, values, start)
+        return np.stack([cells[name] for name in self._columns], axis=1).astype(np.float64)
+
+
+def _text_error(source: str, column: str, values: NDArray[Any], start: int) -> TrajectoryError:
+    """Return the error for a column that holds text."""
+    row = first_text(values.tolist())
+    texts = [repr(text) for text in dict.fromkeys(values.tolist()) if numbers([text]) is None][:4]
+    return TrajectoryError(
+        f"{source}, row {start + row}, column {column!r} is {str(values[row])!r:.60}, expected a "
+        f"number: it holds texts such as {', '.join(texts)}; leave it out, or name it under labels"
+    )
+
+
+class Converter:
+    """Makes rows of observations, actions and rewards of the cells of the chosen columns.
+
+    Parameters
+    ----------
+    selection
+        Columns of the first recording.
+    recipe
+        Its angles and discrete actions.
+    start
+        Number of the first discrete action.
+
+    Attributes
+    ----------
+    sensors, actions
+        Names and units of the result.
+    """
+
+    def __init__(self, selection: Selection, recipe: Recipe, start: int = 0) -> None:
+        self._inputs = len(selection.sensors), len(selection.actions)
+        quantities = [column.quantity for column in selection.sensors]
+        names = [quantity.name for quantity in quantities]
+        matches_any(recipe.angles, names, "sensor that is an angle")
+        self._angles = [matches_any(recipe.angles, [name]) for name in names]
+        self.sensors = tuple(
+            turned
+            for quantity, angle in zip(quantities, self._angles, strict=True)
+            for turned in (_sine_and_cosine(quantity) if angle else (quantity,))
+        )
+        self._scales = [np.pi / _FULL_TURN.get(q.unit, np.pi) for q in quantities]
+        self._start = start
+        self.actions = _actions(selection.actions, recipe)
+        self.discrete = bool(recipe.discrete)
+        self._choices: set[float] | None = set() if len(self.actions) == 1 else None
+
+    @property
+    def width(self) -> int:
+        """Columns of a converted row: sensors, actions, the reward."""
+        return len(self.sensors) + len(self.actions) + 1
+
+    def convert(self, cells: Matrix, source: str, first: int) -> Matrix:
+        """Return converted rows.
+
+        Parameters
+        ----------
+        cells
+            Cells of sensors, actions and maybe rewards.
+        source, first
+            What messages call the recording, and the row of the first cells.
+        """
+        sensors, actions = self._inputs
+        out = np.zeros((len(cells), self.width))
+        columns: list[NDArray[np.float64]] = []
+        for values, angle, scale in zip(cells.T, self._angles, self._scales, strict=False):
+            columns += [np.sin(values * scale), np.cos(values * scale)] if angle else [values]
+        at = len(columns)
+        out[:, :at] = np.stack(columns, axis=1)
+        commands = cells[:, sensors : sensors + actions]
+        if self._choices is not None:
+            self._choices |= {*np.unique(commands).tolist()[: _MOST_CHOICES + 1]}
+            is_few = len(self._choices) <= _MOST_CHOICES
+            self._choices = self._choices if is_few else None
+        out[:, at:-1] = self._one_hot(commands, source, first) if self.discrete else commands
+        if cells.shape[1] > sensors + actions:
+            out[:, -1] = cells[:, -1]
+        return out
+
+    @property
+    def choices(self) -> int:
+        """Number of the choices that actions seem to be: few whole numbers; 0 if not."""
+        numbers = self._choices or {-1.0}
+        is_whole = all(0 <= n < _MOST_CHOICES and n.is_integer() for n in numbers)
+        return int(max(numbers)) + 1 if is_whole and not self.discrete else 0
+
+    def _one_hot(self, commands: Matrix, source: str, first: int) -> Matrix:
+        count, codes = len(self.actions), commands[:, 0] - self._start
+        wrong = ~np.isin(codes, np.arange(count))
+        if wrong.any():
+            i = int(wrong.argmax())
+            raise TrajectoryError(
+                f"{source}: action {first + i} is {commands[i, 0]:g}, expected a whole number from "
+                f"{self._start} to {self._start + count - 1}"
+            )
+        return np.eye(count)[codes.astype(np.intp)]
+
+
+def _sine_and_cosine(quantity: Quantity) -> tuple[Quantity, Quantity]:
+    if quantity.unit not in {"1", "rad", *_FULL_TURN}:
+        raise UsageError(
+            f"angles: {quantity.name!r} is in {quantity.unit}, expected rad or deg, as in "
+            f"sensors = ['{quantity.name}[rad]']"
+        )
+    return Quantity(f"sin {quantity.name}", "1"), Quantity(f"cos {quantity.name}", "1")
+
+
+def _actions(columns: Sequence[ChosenColumn], recipe: Recipe) -> tuple[Quantity, ...]:
+    """Return names and units of actions: of discrete ones, those of the columns of one-hot rows."""
+    if not recipe.discrete or not columns:
+        return tuple(column.quantity for column in columns)
+    if len(columns) > 1:
+        raise UsageError(
+            f"there are {len(columns)} columns of actions, expected one as actions are discrete"
+        )
+    if isinstance(recipe.discrete, tuple):
+        return tuple(Quantity(name, "1") for name in recipe.discrete)
+    if recipe.discrete > _MOST_ACTIONS:
+        raise UsageError(
+            f"there are {recipe.discrete} discrete actions, expected at most {_MOST_ACTIONS}, as "
+            "each becomes a column: import them as amounts, without discrete"
+        )
+    return tuple(Quantity(f"action {i}", "1") for i in range(recipe.discrete))
+
+
+class Spool:
+    """Rows on disk until they are written into a split: a part's rows never all lie in memory.
+
+    Parameters
+    ----------
+    width
+        Columns of a row.
+    """
+
+    def __init__(self, width: int) -> None:
+        self._width, self.rows = width, 0
+        # Open as long as the spool is.
+        self._file = tempfile.TemporaryFile(prefix="oodd-eval-")  # noqa: SIM115
+
+    def append(self, block: Matrix) -> None:
+        """Add rows."""
+        try:
+            self._file.seek(self.rows * self._width * 8)
+            self._file.write(np.ascontiguousarray(block, "<f8").data)
+            self._file.flush()
+        except OSError as error:
+            raise OutputError(
+                f"rows cannot be kept in {tempfile.gettempdir()!r} while they are read: {error}; "
+                "the variable TMPDIR names another folder"
+            ) from error
+        self.rows += len(block)
+
+    def read(self, start: int, stop: int) -> Matrix:
+        """Return the rows of a range."""
+        self._file.seek(start * self._width * 8)
+        content = self._file.read((stop - start) * self._width * 8)
+        return np.frombuffer(content, "<f8").reshape(-1, self._width)
+
+    def close(self) -> None:
+        """Remove the rows."""
+        with contextlib.suppress(OSError):  # rows that a full disk did not take
+            self._file.close()
+
+
+def spool_stretch(
+    spool: Spool, stretch: Stretch, topics: dict[str, TopicRows], converter: Converter, source: str
+) -> None:
+    """Read the rows of a stretch from all topics and add them to a spool."""
+    step = max(64, _CELLS // converter.width)
+    width = sum(len(rows.indices) for rows in topics.values())
+    for start in range(0, stretch.rows, step):
+        stop = min(start + step, stretch.rows)
+        cells = np.empty((stop - start, width))
+        for name, rows in topics.items():
+            cells[:, rows.indices] = rows.rows(stretch.sources[name][start:stop])
+        spool.append(converter.convert(cells, source, start))

@@ -1,0 +1,1 @@
+"""Which recorded episodes are odd: a watchdog on episodes of logs."""

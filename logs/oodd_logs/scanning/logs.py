@@ -1,0 +1,99 @@
+"""Logs as a scan reads them: every episode in recorded order, labelled or not."""
+
+import itertools
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from oodd_logs.episodes import EVERY, Episode, names_matching, read_every_episode
+from oodd_logs.inspection.draft import draft
+from oodd_logs.inspection.logs import inspect_logs, recognised
+from oodd_logs.inspection.meaning import window_of
+from oodd_logs.recipe import Recipe
+from oodd_logs.scanning.outliers import ENOUGH
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecordedLogs:
+    """Episodes in recorded order.
+
+    Attributes
+    ----------
+    episodes
+        All of them, with their labels.
+    sensors
+        Names of the columns.
+    baseline
+        Rows at the start of every episode that are nominal.
+    notes
+        What was read and left out, a sentence each.
+    """
+
+    episodes: list[Episode]
+    sensors: list[str]
+    baseline: int
+    notes: list[str]
+
+
+def read_logs(
+    path: Path,
+    recipe: Recipe | None = None,
+    form: str = "",
+    options: Mapping[str, Any] | None = None,
+    window: int | None = None,
+    home: Path | None = None,
+) -> RecordedLogs:
+    """Read all episodes of logs.
+
+    Parameters
+    ----------
+    path
+        A file, a folder, or the directory of a data set; with a recipe, what its files are
+        relative to.
+    recipe
+        By default a first one, as ``data inspect`` writes it.
+    form, options
+        Format of the files and options of its reader, without a recipe; by default it is
+        recognised.
+    window
+        Rows to which longer recordings are cut, in place of the recipe's. Without a recipe, 20
+        recordings and more are left whole, and fewer are cut as ``data inspect`` advises.
+    home
+        Folder of the recipe. Its files are relative to this where the logs are in it and no file
+        that it lists is relative to `path`.
+
+    Returns
+    -------
+    RecordedLogs
+    """
+    reader, files, _ = recognised(path, form or (recipe.format if recipe else ""))
+    root = path if path.is_dir() and files != [path] else path.parent
+    if recipe is None:
+        logs = inspect_logs(path, reader.name, options or {})
+        recipe = Recipe.parse(tomllib.loads(draft(logs)))
+        files = list(dict.fromkeys(root / recording.file for recording in logs.recordings))
+        if window is None:
+            window = 0 if len(logs.recordings) >= ENOUGH else window_of(logs)
+    if window is not None:
+        recipe = replace(recipe, window=window, nominal=replace(recipe.nominal, window=None))
+    if home is not None and files[0].is_relative_to(home) and not _lists(recipe, root):
+        root = home
+    with read_every_episode(recipe, root, files) as source:
+        return RecordedLogs(
+            list(source.episodes(EVERY)),
+            [sensor.name for sensor in source.sensors],
+            recipe.baseline,
+            list(source.notes),
+        )
+
+
+def _lists(recipe: Recipe, root: Path) -> bool:
+    """Tell whether any file of a recipe is there, relative to a folder."""
+    nominal = recipe.nominal
+    tables = (table.files for table in recipe.anomalous.values())
+    patterns = itertools.chain(
+        nominal.files, nominal.train, nominal.calibration, nominal.test, nominal.twins, *tables
+    )
+    return any(names_matching(pattern, root) for pattern in patterns)

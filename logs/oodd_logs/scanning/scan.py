@@ -1,0 +1,646 @@
+"""Find the odd ones among recorded episodes, with their odd rows and sensors.
+
+Each episode is judged by a detector that was fitted on others, and its largest statistic by theirs.
+Faults of the stream, such as gaps and frozen sensors, are looked for by themselves.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from multiprocessing import get_context
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from oodd_eval.data.baseline import Baseline
+from oodd_eval.data.bounded import without_nan
+from oodd_eval.data.trajectory import Trajectory
+from oodd_eval.errors import ContractError, OoddError, UnknownNameError, UsageError
+from oodd_eval.live.handle import DetectorHandle
+from oodd_eval.live.nominal import sensor_names
+from oodd_eval.live.watchdog import Watchdog
+from oodd_eval.metrics.accumulation import AlarmKind, Ranks
+from oodd_eval.metrics.alarms import GuaranteedAlarm
+from oodd_eval.metrics.cusum import Standardization
+from oodd_eval.names import counted
+from oodd_eval.plugins.contract import AnyDetector
+from oodd_eval.plugins.explanations import ExplainingDetector, Explanation, checked_explanation
+from oodd_logs.episodes import Episode
+from oodd_logs.marks import runs_of
+from oodd_logs.scanning.episode_faults import EpisodeFault, breaks_of, clean, gaps, stream_faults
+from oodd_logs.scanning.limits import FITS, SHORTEST, WINDOWS
+from oodd_logs.scanning.outliers import (
+    ENOUGH,
+    LEAST,
+    Tail,
+    critical_p,
+    q_values,
+    rank_p,
+    rank_threshold,
+)
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScannedEpisode:
+    """Verdict of a scan on one episode.
+
+    Attributes
+    ----------
+    episode
+        As it was recorded.
+    scores, statistic
+        By row, of shape (R,); NaN and minus infinity where there is none.
+    largest
+        The largest statistic.
+    rank_p
+        Its conformal p-value: the rank among the others, ties counted against the episode.
+    p, q
+        P-value, from the tail beyond the others' median, and Benjamini and Hochberg's q-value; NaN
+        where the others are too few.
+    threshold
+        Of the statistic, which makes an episode odd; NaN where the others are too few.
+    odd
+        Whether it is odd, by its q-value or for a fault of the stream.
+    row, since
+        First row with a statistic above the threshold, and the row with which that began as seen
+        then; None where the statistic stays below.
+    intervals
+        Rows [start, stop) with a statistic above the threshold.
+    sensors
+        Share of each sensor in the evidence at that row, by name, the largest first.
+    faults
+        Of the stream.
+    """
+
+    episode: Episode
+    scores: Floats
+    statistic: Floats
+    largest: float
+    rank_p: float
+    p: float
+    q: float
+    threshold: float
+    odd: bool
+    row: int | None
+    since: int | None
+    intervals: tuple[tuple[int, int], ...]
+    sensors: Mapping[str, float]
+    faults: tuple[EpisodeFault, ...]
+
+    @property
+    def first(self) -> int | None:
+        """The first odd row, of the statistic or of a fault; None where there is none."""
+        rows = [f.row for f in self.faults]
+        if self.since is not None:
+            rows.append(self.since)
+        return min(rows, default=None)
+
+    @property
+    def alarms(self) -> NDArray[np.bool_]:
+        """True for each odd row, shape (R,): in the intervals, or where a fault began."""
+        rows = np.zeros(len(self.scores), dtype=np.bool_)
+        for start, stop in self.intervals:
+            rows[start:stop] = True
+        rows[[fault.row for fault in self.faults]] = True
+        return rows
+
+    @property
+    def suspects(self) -> list[str]:
+        """Names of sensors with a fault, else of those with most evidence, which come first."""
+        faulty = list(dict.fromkeys(f.what for f in self.faults))
+        named = [name for name, share in self.sensors.items() if share >= 1 / len(self.sensors)]
+        return faulty or named[:3]
+
+    @property
+    def label(self) -> str:
+        """Labels of the episode in its logs, by which nothing here is judged."""
+        episode = self.episode
+        parts = [episode.kind] if episode.kind else []
+        parts += [f"{max(start, 0)} to {stop}" for start, stop in episode.intervals]
+        parts += ["failure"] if episode.outcome is False and not episode.kind else []
+        return ", ".join(parts)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the episode as values for JSON, which docs/how-to/scan.md describes.
+
+        Returns
+        -------
+        dict
+            With None in place of what is undefined or infinite.
+        """
+        time, first = self.episode.time, self.first
+        figures = ("p", "q", "rank_p", "largest", "threshold")
+        values = {
+            "name": self.episode.name,
+            "source": self.episode.source,
+            "rows": len(self.scores),
+            "odd": self.odd,
+            **{name: getattr(self, name) for name in figures},
+            "first_odd_row": first,
+            "first_odd_time": None if time is None or first is None else time[first],
+            "alarm_row": self.row,
+            "intervals": self.intervals,
+            "suspects": self.suspects,
+            "sensors": self.sensors,
+            "faults": [asdict(fault) for fault in self.faults],
+            "label": self.label,
+        }
+        plain: dict[str, Any] = without_nan(values)
+        return plain
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scan:
+    """Result of `scan_episodes`.
+
+    Attributes
+    ----------
+    episodes
+        In the order of the recorded ones.
+    sensors
+        Their names.
+    judge
+        What the episodes were judged by, in words.
+    fdr
+        Of the episodes that are odd by their q-value, the largest share that is nominal, as far as
+        the tail is as light as assumed.
+    notes
+        What is to be known about it, a sentence each.
+    """
+
+    episodes: Sequence[ScannedEpisode]
+    sensors: Sequence[str]
+    judge: str
+    fdr: float
+    notes: Sequence[str]
+
+    @property
+    def odd(self) -> list[ScannedEpisode]:
+        """The odd episodes, in recorded order."""
+        return [one for one in self.episodes if one.odd]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the scan as values for JSON, which docs/how-to/scan.md describes.
+
+        Returns
+        -------
+        dict
+            With None in place of what is undefined or infinite.
+        """
+        return {
+            "schema": "oodd-eval/scan/1",
+            "judge": self.judge,
+            "fdr": self.fdr,
+            "sensors": list(self.sensors),
+            "notes": list(self.notes),
+            "odd": [one.episode.name for one in self.odd],
+            "episodes": [one.as_json() for one in self.episodes],
+        }
+
+
+SCANNER: Final = "panel"
+"""Detector that scans where none is named."""
+_QUICK: Final = {"forecast": "linear"}  # of it: networks would be fitted 20 times
+
+Outcome = tuple[Floats, Explanation | None]
+"""Answer of a detector about one episode: scores, and an explanation if it gives any."""
+
+
+def scan_episodes(
+    episodes: Sequence[Episode | ArrayLike],
+    *,
+    sensors: Sequence[Any] | None = None,
+    detector: AnyDetector = SCANNER,
+    watchdog: Watchdog | None = None,
+    fdr: float = 0.1,
+    window: int | None = None,
+    baseline: int = 0,
+    seed: int = 0,
+    horizon: int = 1,
+    parameters: Mapping[str, Any] | None = None,
+    jobs: int = 1,
+) -> Scan:
+    """Tell which of some recorded episodes are odd, and which of their rows and sensors.
+
+    Most of them have to be nominal: up to a fifth may be odd without hiding one another. With up
+    to 20 episodes each is judged by a fit on all others; more are judged in 20 groups.
+
+    Parameters
+    ----------
+    episodes
+        In recorded order: episodes as recipes read them, or arrays of shape (R, D) with NaN for
+        what is missing. A single one is cut into windows.
+    sensors
+        Names, or quantities with names; default "sensor 0" and so on.
+    detector
+        Name of an installed detector, a class or function that makes one, or an unfitted one.
+    watchdog
+        Judges all episodes in place of a detector that is fitted on them.
+    fdr
+        False discovery rate: of the episodes that are called odd, the largest share that is
+        nominal, on average. It rests on an assumed tail, and on nothing where a watchdog has
+        calibration episodes enough: at least the number of episodes over `fdr`, less one.
+    window
+        Rows of the windows that the episodes are cut into; by default they are not.
+    baseline
+        Number of rows at the start of every episode that are nominal. They are not judged, and
+        each sensor's mean and spread over them are brought to those of the other episodes.
+    seed, horizon, parameters
+        For the factory of a named detector, the class or the function. Of `panel`, which is the
+        default, ``forecast`` is ``"linear"`` unless it is given: networks would be fitted 20 times.
+    jobs
+        Fits at a time, in processes of their own where more than 1.
+
+    Returns
+    -------
+    Scan
+
+    Raises
+    ------
+    UsageError
+        When an argument is wrong, or no episode is long enough.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> logs = [rng.normal(size=(200, 3)) for _ in range(20)]
+    >>> logs[7][120:, 1] += 4
+    >>> [odd] = scan_episodes(logs, sensors=["speed", "torque", "current"]).odd
+    >>> odd.episode.name, abs(odd.first - 120) <= 3, odd.suspects
+    ('episode 7', True, ['torque'])
+    """
+    if not 0 < fdr < 1:
+        raise UsageError(f"fdr={fdr!r}, expected a share between 0 and 1")
+    recorded = [_as_episode(one, i) for i, one in enumerate(episodes)]
+    widths = sorted({one.observations.shape[1] for one in recorded})
+    if len(widths) != 1:
+        raise UsageError(f"episodes have {widths} sensors, expected the same number in all")
+    names = sensor_names(sensors, widths[0])
+    recorded, notes = _cut(recorded, window)
+    shortest = baseline + SHORTEST
+    usable = [one for one in recorded if len(one.observations) >= shortest]
+    if len(usable) < len(recorded):
+        count = len(recorded) - len(usable)
+        notes.append(f"Left out: {counted(count, 'episode(s)')} of fewer than {shortest} rows.")
+    if not usable:
+        raise UsageError(f"no episode of at least {shortest} rows: nothing to judge")
+    if watchdog is not None:
+        return _scan_with(watchdog, usable, names, fdr, notes)
+    if len(usable) < SHORTEST:
+        rows = len(usable[0].observations)
+        raise UsageError(
+            f"a single episode of {rows} rows cannot be judged by others: record more, cut it into "
+            f"windows (--window, window=) of {max(SHORTEST, rows // FITS)} rows, say, or judge it "
+            "by a saved watchdog"
+        )
+    cleaned, spread = clean(usable)
+    faults = stream_faults(usable, cleaned, spread, names, fdr)
+    defaults = _QUICK if detector == SCANNER else {}
+    fit = _Fit(detector, seed, horizon, {**defaults, **(parameters or {})}, baseline)
+    handle = fit.handle()
+    trajectories = [one.trajectory for one in cleaned]
+    folds = [list(range(k, len(usable), FITS)) for k in range(min(FITS, len(usable)))]
+    work = [
+        ([x for i, x in enumerate(trajectories) if i not in fold], [trajectories[i] for i in fold])
+        for fold in folds
+    ]
+    outcomes = dict(zip((i for fold in folds for i in fold), _all(fit, work, jobs), strict=True))
+    scores = [outcomes[i][0] for i in range(len(usable))]
+    judged = [
+        _Judged(
+            one,
+            scores[i],
+            _statistic(handle.alarm, scores, _peers(usable, i), i),
+            outcomes[i][1],
+            faults[i],
+            cleaned[i].trajectory,
+            baseline,
+        )
+        for i, one in enumerate(usable)
+    ]
+    how = "each episode is judged by a fit that has not seen it."
+    notes.insert(0, f"{counted(len(usable), 'episode(s)')}, {counted(len(folds), 'fit(s)')}: {how}")
+    name = handle.state["name"] or type(handle.detector).__name__
+    return _verdict(judged, names, _Terms(f"{name}, fitted on the other episodes", fdr, notes))
+
+
+def _as_episode(one: Episode | ArrayLike, number: int) -> Episode:
+    if isinstance(one, Episode):
+        return one
+    rows = np.asarray(one, dtype=np.float64)
+    if rows.ndim != 2 or 0 in rows.shape:
+        raise UsageError(f"episode {number} has shape {rows.shape}, expected (rows, sensors)")
+    name = f"episode {number}"
+    return Episode(name, name, rows, np.empty((len(rows) - 1, 0)), None)
+
+
+def _cut(episodes: list[Episode], window: int | None) -> tuple[list[Episode], list[str]]:
+    """Return windows of the episodes, the last of each maybe shorter, and what to say of it."""
+    notes = []
+    if window is None and len(episodes) == 1 and len(episodes[0].observations) >= WINDOWS * LEAST:
+        window = len(episodes[0].observations) // WINDOWS
+        notes = [f"A single recording, cut into windows of {window} rows (window=)."]
+    if window is None:
+        return episodes, notes
+    if window < SHORTEST:
+        raise UsageError(f"window={window}, expected at least {SHORTEST} rows")
+    return [
+        _rows(one, start, start + window)
+        for one in episodes
+        for start in range(0, len(one.observations), window)
+    ], notes
+
+
+def _rows(one: Episode, start: int, stop: int) -> Episode:
+    inside = [(max(a, start) - start, min(b, stop) - start) for a, b in one.intervals if a >= 0]
+    return replace(
+        one,
+        name=f"{one.name}[{start}:{start + len(one.observations[start:stop])}]",
+        observations=one.observations[start:stop],
+        actions=one.actions[start : stop - 1],
+        rewards=None,
+        intervals=tuple((a, b) for a, b in inside if a < b),
+        time=None if one.time is None else one.time[start:stop],
+    )
+
+
+def _scan_with(
+    watchdog: Watchdog, episodes: list[Episode], names: list[str], fdr: float, notes: list[str]
+) -> Scan:
+    """Let a watchdog judge all episodes, row by row as beside a robot."""
+    unknown = [name for name in watchdog.sensors if name not in names]
+    if unknown:
+        raise UnknownNameError("sensor of the logs", unknown[0], names)
+    order = [names.index(name) for name in watchdog.sensors]
+    episodes = [replace(one, observations=one.observations[:, order]) for one in episodes]
+    breaks = breaks_of(episodes)
+    judged = [
+        _watched(watchdog.copy(), one, float(longest), rows.trajectory)
+        for one, longest, rows in zip(episodes, breaks, clean(episodes)[0], strict=True)
+    ]
+    notes.insert(
+        0, f"{counted(len(episodes), 'episode(s)')}, judged by a watchdog: {watchdog.promise}."
+    )
+    terms = _Terms("a watchdog", fdr, notes, watchdog.rule.threshold)
+    if (known := watchdog.calibration) is not None:
+        enough = (len(known.largest) + 1) * fdr >= len(episodes)
+        reference = np.array(known.largest)
+        terms = replace(terms, reference=reference, exact=enough and not known.rolling)
+    return _verdict(judged, watchdog.sensors, terms)
+
+
+def _watched(watchdog: Watchdog, one: Episode, longest: float, trajectory: Trajectory) -> "_Judged":
+    rows, sensors = one.observations.shape
+    scores, statistic = np.full((2, rows), np.nan)
+    shares, onsets = np.full((rows, sensors), np.nan), np.full(rows, -1)
+    faults: dict[tuple[str, str], int] = {}
+    actions = [None, *one.actions] if one.actions.shape[1] else [None] * rows
+    times = [None] * rows
+    if one.time is not None and watchdog.settings.rate is not None:
+        times = one.time.tolist()
+    for t, (row, action) in enumerate(zip(one.observations, actions, strict=True)):
+        reading = watchdog.update(row, action, times[t])
+        scores[t], statistic[t] = reading.score, reading.statistic
+        if reading.onset is not None:
+            onsets[t] = reading.onset
+            shares[t] = [reading.sensors.get(name, 0.0) for name in watchdog.sensors]
+        for key in reading.faults.items():
+            faults.setdefault(key, t)
+    seen = *(EpisodeFault(*key, t) for key, t in faults.items()), *gaps(one.time, longest)
+    return _Judged(one, scores, statistic, Explanation(shares, onsets), seen, trajectory)
+
+
+@dataclass(frozen=True, slots=True)
+class _Fit:
+    """A function that makes a detector for one fit."""
+
+    detector: AnyDetector
+    seed: int
+    horizon: int
+    parameters: Mapping[str, Any]
+    baseline: int
+
+    def handle(self) -> DetectorHandle:
+        """Return a new detector."""
+        return DetectorHandle.make(
+            self.detector, None, self.seed, self.horizon, self.parameters, self.baseline
+        )
+
+    def judge(self, others: Sequence[Trajectory], episodes: Sequence[Trajectory]) -> list[Outcome]:
+        """Fit on some episodes and judge others."""
+        handle = self.handle()
+        detector, base = handle.detector, None
+        if self.baseline:
+            base = Baseline.fit(others, self.baseline)
+        hidden = 0 if handle.adapts else self.baseline
+        try:
+            detector.fit([handle.visible(x, base) for x in others])
+            outcomes: list[Outcome] = []
+            for x in episodes:
+                scores, explanation = handle.scores(x, base), None
+                if isinstance(detector, ExplainingDetector):
+                    visible = handle.visible(x, base)
+                    shares, onsets = checked_explanation(detector.explain(visible), visible)
+                    explanation = Explanation(
+                        np.pad(shares, ((hidden, 0), (0, 0)), constant_values=np.nan),
+                        np.pad(
+                            np.where(onsets < 0, -1, onsets + hidden),
+                            (hidden, 0),
+                            constant_values=-1,
+                        ),
+                    )
+                outcomes.append((scores, explanation))
+        except OoddError:
+            raise
+        except Exception as error:
+            name = type(detector).__name__
+            what = f"detector {name} raised {type(error).__name__}: {error}"
+            raise ContractError(f"{what} (fitted on {len(others)} episodes)") from error
+        return outcomes
+
+
+def _all(
+    fit: _Fit, work: Sequence[tuple[list[Trajectory], list[Trajectory]]], jobs: int
+) -> list[Outcome]:
+    if jobs == 1:
+        return [one for task in work for one in fit.judge(*task)]
+    with ProcessPoolExecutor(min(jobs, len(work)), get_context("spawn")) as pool:
+        return [one for part in pool.map(fit.judge, *zip(*work, strict=True)) for one in part]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Judged:
+    """One episode with what a detector and the stream say about it.
+
+    Of the trajectory the first `baseline` rows are what readings are compared with.
+    """
+
+    episode: Episode
+    scores: Floats
+    statistic: Floats
+    explanation: Explanation | None
+    faults: tuple[EpisodeFault, ...]
+    trajectory: Trajectory
+    baseline: int = 0
+
+    @property
+    def evidence(self) -> Floats:
+        """Readings and their steps, (2, R, D), for what a detector does not explain."""
+        rows = self.trajectory.observations.astype(np.float64)
+        if self.baseline:
+            rows -= rows[: self.baseline].mean(axis=0)
+        return np.stack([rows, np.diff(rows, axis=0, prepend=rows[:1])])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Terms:
+    """Comparison of statistics: with those of `reference`, by default of the other episodes.
+
+    If `exact`, these are enough for p-values by rank. Where they are too few for any, what is above
+    the limit is odd.
+    """
+
+    judge: str
+    fdr: float
+    notes: list[str]
+    limit: float = math.nan
+    reference: Floats | None = None
+    exact: bool = False
+
+
+_EXACT: Final = (
+    "The {} calibration episodes are enough for p-values by rank, which keep the false discovery "
+    "rate whatever the distribution."
+)
+
+
+def _verdict(judged: Sequence[_Judged], names: Sequence[str], terms: _Terms) -> Scan:
+    """Compare the episodes' largest statistics, and look for rows and sensors."""
+    episodes = [one.episode for one in judged]
+    largest = np.array([np.nanmax(one.statistic, initial=-math.inf) for one in judged])
+    references = [
+        largest[_peers(episodes, i)] if terms.reference is None else terms.reference
+        for i in range(len(episodes))
+    ]
+    tails = [Tail.fit(others) for others in references]
+    ranks = np.array([rank_p(x, others) for x, others in zip(largest, references, strict=True)])
+    p = ranks.copy()
+    for i, tail in enumerate(tails):
+        if tail is not None and largest[i] > tail.start and not terms.exact:
+            p[i] = tail.p(largest[i])
+    fewest = min(map(len, references)) + 1
+    notes, known = terms.notes, fewest >= LEAST
+    if not known:
+        p[:] = math.nan
+        notes = [*notes, _too_few(fewest, terms)]
+    elif terms.exact:
+        notes = [*notes, _EXACT.format(fewest - 1)]
+    q = q_values(p) if known else p
+    critical = critical_p(p, terms.fdr) if known else math.nan
+    sums = np.stack([_sums(one.evidence) for one in judged])
+    scanned = []
+    for i, one in enumerate(judged):
+        tail, threshold = tails[i], terms.limit
+        if known:
+            threshold = math.nan if tail is None else tail.threshold(critical)
+            if terms.exact:
+                threshold = rank_threshold(critical, references[i])
+        rejected = bool(q[i] <= terms.fdr if known else largest[i] > terms.limit)
+        # Rounding of the threshold may leave nothing but the largest statistic.
+        above = runs_of(rejected & (one.statistic >= np.fmin(threshold, largest[i])))
+        row = since = None
+        shares: dict[str, float] = {}
+        if rejected:
+            row = above[0][0]
+            others = np.delete(sums, i, axis=0).sum(axis=0)
+            usual = -math.inf if tail is None else tail.start
+            since, values = _blame(one, usual, above[0], others)
+            order = np.argsort(-values, kind="stable").tolist()
+            shares = {names[d]: float(values[d]) for d in order}
+        scanned.append(
+            ScannedEpisode(
+                one.episode,
+                one.scores,
+                one.statistic,
+                float(largest[i]),
+                float(ranks[i]),
+                float(p[i]),
+                float(q[i]),
+                threshold,
+                rejected or bool(one.faults),
+                row,
+                since,
+                tuple(above),
+                shares,
+                one.faults,
+            )
+        )
+    return Scan(scanned, names, terms.judge, terms.fdr, notes)
+
+
+def _peers(episodes: Sequence[Episode], i: int) -> list[int]:
+    """Return what an episode is compared with: others of its task where these suffice, else all."""
+    others = [j for j in range(len(episodes)) if j != i]
+    same = [j for j in others if episodes[j].task == episodes[i].task]
+    return same if len(same) + 1 >= LEAST else others
+
+
+def _statistic(kind: AlarmKind, scores: Sequence[Floats], peers: Sequence[int], i: int) -> Floats:
+    """Return the statistic of an episode's scores.
+
+    A CUSUM and other sums standardize them with the median of its peers' means and of their
+    deviations, which no odd episode among them spoils; an e-detector ranks them among all of its
+    peers' scores.
+    """
+    standardization: Standardization | Ranks | None = None
+    if kind == "e-detector":
+        standardization = Ranks.fit(scores[j] for j in peers)
+    elif kind != "score":
+        known = (Standardization.fit([scores[j]]) for j in peers)
+        mean, std = np.nanmedian([[one.mean, one.std] for one in known], axis=0)
+        standardization = Standardization(float(mean), float(std))
+    return GuaranteedAlarm(standardization, math.inf, kind).statistic(scores[i])
+
+
+def _too_few(count: int, terms: _Terms) -> str:
+    deciding = "faults of the stream decide"
+    if terms.limit > 0:
+        deciding = "the watchdog's threshold decides"
+    return (
+        f"{count} episodes are too few to judge one by the others, which takes {LEAST} and works "
+        f"well from {ENOUGH} on: here {deciding} alone. Record more, or cut long ones "
+        "(window)."
+    )
+
+
+def _blame(
+    judged: _Judged, usual: float, interval: tuple[int, int], others: Floats
+) -> tuple[int, Floats]:
+    """Return the row with which an excursion began, and the share of each sensor in it, (D,).
+
+    It is above the threshold in the interval; before it the statistic was above what is usual.
+    """
+    row, stop = interval
+    if judged.explanation is not None and judged.explanation.onsets[row] >= 0:
+        return int(judged.explanation.onsets[row]), judged.explanation.shares[row]
+    quiet = np.flatnonzero(judged.statistic[:row] <= usual)
+    since = int(quiet[-1]) + 1 if len(quiet) else 0
+    n, total, squares = others[:, :, None]
+    # A single episode has no others.
+    mean = total / np.maximum(n, 1.0)
+    std = np.sqrt(np.maximum(squares / np.maximum(n, 1.0) - mean**2, 0.0))
+    least = 1e-6 * np.maximum(1.0, np.abs(mean))
+    # Readings, or their steps if these are farther from those of the others.
+    deviations = (np.abs(judged.evidence - mean) / np.maximum(std, least)).max(axis=0)
+    of_excursion = (deviations[since:stop] ** 2).mean(axis=0)
+    return since, of_excursion / (of_excursion.sum() or 1.0)
+
+
+def _sums(evidence: Floats) -> Floats:
+    """Return number, sum and sum of squares of readings and of steps, (3, 2, D)."""
+    sums: Floats = np.stack([np.ones_like(evidence), evidence, evidence**2]).sum(axis=2)
+    return sums

@@ -1,0 +1,168 @@
+"""Scans for the viewers that people have open: Rerun and whatever reads MCAP."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from oodd_eval.data.bounded import without_nan
+from oodd_eval.data.files import replacing
+from oodd_eval.errors import MissingExtraError
+from oodd_eval.live.reading import as_nanoseconds
+from oodd_logs.scanning.scan import Scan, ScannedEpisode
+
+_EXTRA: Final = "pip install 'oodd-eval[viewers]'"
+_NUMBER: Final = {"type": ["number", "null"]}
+_VERDICT: Final = {
+    "score": _NUMBER,
+    "statistic": _NUMBER,
+    "threshold": _NUMBER,
+    "alarm": {"type": "boolean"},
+    "suspects": {"type": "array", "items": {"type": "string"}},
+}
+
+
+def write_rerun(scan: Scan, path: Path) -> None:
+    """Write a scan as a recording of Rerun, which no viewer is started for.
+
+    Each episode is an entity ``/NAME`` with ``sensors/SENSOR``, ``score``, ``statistic``,
+    ``threshold`` and ``alarm`` over the timelines ``row`` and, where there are stamps, ``time``,
+    and a text ``suspects`` at its first odd row.
+
+    Parameters
+    ----------
+    scan
+        What to write.
+    path
+        The file, ``.rrd``.
+
+    Raises
+    ------
+    MissingExtraError
+        Without rerun-sdk.
+    """
+    try:
+        import rerun as rr  # noqa: PLC0415
+    except ImportError:
+        raise MissingExtraError(f"a recording for Rerun needs rerun-sdk: {_EXTRA}") from None
+    with replacing(path) as temporary:
+        recording = rr.RecordingStream("oodd-eval scan")
+        recording.save(temporary)
+        for name, one in _named(scan):
+
+            def send(entity: tuple[str, ...], rows: Any, columns: Any) -> None:
+                timelines = [rr.TimeColumn("row", sequence=rows)]
+                if (time := one.episode.time) is not None:  # noqa: B023  called in this turn
+                    timelines.append(rr.TimeColumn("time", duration=time[rows]))
+                path = rr.new_entity_path([name, *entity])  # noqa: B023
+                recording.send_columns(path, timelines, columns)
+
+            usable = np.arange(len(one.scores))
+            if one.episode.time is not None:
+                usable = usable[np.isfinite(one.episode.time)]
+            for entity, values in _series(one, scan).items():
+                rows = usable[np.isfinite(values[usable])]
+                send(entity, rows, rr.Scalars.columns(scalars=values[rows]))
+            if (first := one.first) is not None and first in usable:
+                text = [", ".join(one.suspects)]
+                send(("suspects",), np.array([first]), rr.TextLog.columns(text=text))
+        recording.flush()
+        recording.disconnect()
+
+
+def write_mcap(scan: Scan, path: Path) -> None:
+    """Write a scan as MCAP with messages in JSON, two topics an episode.
+
+    ``/NAME/sensors`` has the readings by sensor, ``/NAME/oodd`` score, statistic, threshold, alarm
+    and suspects, both with a JSON schema. Without time stamps rows are a second apart.
+
+    Parameters
+    ----------
+    scan
+        What to write.
+    path
+        The file, ``.mcap``.
+
+    Raises
+    ------
+    MissingExtraError
+        Without mcap.
+    """
+    try:
+        from mcap.writer import Writer  # noqa: PLC0415
+    except ImportError:
+        raise MissingExtraError(f"MCAP needs the library mcap: {_EXTRA}") from None
+    readings = dict.fromkeys(scan.sensors, _NUMBER)
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        writer = Writer(file)
+        writer.start(library="oodd-eval")
+        schemas = {
+            kind: writer.register_schema(
+                f"oodd.{kind}",
+                "jsonschema",
+                json.dumps({"type": "object", "properties": properties}).encode(),
+            )
+            for kind, properties in (("sensors", readings), ("oodd", _VERDICT))
+        }
+        for name, one in _named(scan):
+            channels = {
+                kind: writer.register_channel(f"/{name}/{kind}", "json", schema)
+                for kind, schema in schemas.items()
+            }
+            for t, message in enumerate(_messages(one, scan)):
+                stamp = _nanoseconds(one, t)
+                for kind, channel in channels.items():
+                    content = json.dumps(without_nan(message[kind])).encode()
+                    writer.add_message(channel, stamp, content, stamp, t)
+        finish: Any = writer.finish  # without types in the library
+        finish()
+
+
+def _named(scan: Scan) -> list[tuple[str, ScannedEpisode]]:
+    """Return the episodes by name, with their number where a name occurs twice."""
+    names = [one.episode.name for one in scan.episodes]
+    return [
+        (name if names.count(name) == 1 else f"{name} ({i})", one)
+        for i, (name, one) in enumerate(zip(names, scan.episodes, strict=True))
+    ]
+
+
+def _series(one: ScannedEpisode, scan: Scan) -> dict[tuple[str, ...], Any]:
+    columns = one.episode.observations.T
+    readings = {("sensors", name): c for name, c in zip(scan.sensors, columns, strict=True)}
+    return readings | {
+        ("score",): one.scores,
+        ("statistic",): one.statistic,
+        ("threshold",): np.full(len(one.scores), one.threshold),
+        ("alarm",): one.alarms.astype(np.float64),
+    }
+
+
+def _messages(one: ScannedEpisode, scan: Scan) -> list[dict[str, Any]]:
+    return [
+        {
+            "sensors": dict(zip(scan.sensors, row, strict=True)),
+            "oodd": {
+                "score": score,
+                "statistic": statistic,
+                "threshold": one.threshold,
+                "alarm": alarm,
+                "suspects": one.suspects if alarm else [],
+            },
+        }
+        for row, score, statistic, alarm in zip(
+            one.episode.observations.tolist(),
+            one.scores.tolist(),
+            one.statistic.tolist(),
+            one.alarms.tolist(),
+            strict=True,
+        )
+    ]
+
+
+def _nanoseconds(one: ScannedEpisode, t: int) -> int:
+    time = one.episode.time
+    seconds = float(t) if time is None else float(time[t])
+    return max(0, as_nanoseconds(seconds)) if math.isfinite(seconds) else 0

@@ -1,0 +1,316 @@
+"""Columns that a recipe names: which column of which topic is a sensor, an action, a label.
+
+A column goes by its name in the file, with and without its unit in brackets, with and without the
+prefix ``obs:`` or ``action:``, below its topic where a recording has several.
+"""
+
+import dataclasses
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from oodd_eval.data.facts import Quantity
+from oodd_eval.errors import TrajectoryError, UnknownNameError, UsageError
+from oodd_logs.readers.cells import nearest_spelling
+from oodd_logs.recipe import Recipe
+from oodd_logs.recording import Recording
+
+_PREFIX: Final = re.compile(r"\s*(obs|action)\s*:\s*(?=\S)", re.IGNORECASE)
+_UNIT: Final = re.compile(r"(.*?[^\[\]\s])\s*\[\s*([^\[\]]*[^\[\]\s])\s*\]")
+
+
+@dataclass(frozen=True, slots=True)
+class ChosenColumn:
+    """A column that a recipe names.
+
+    Parameters
+    ----------
+    topic, column
+        Where it is, as the file calls both.
+    quantity
+        Name and unit in the split.
+    """
+
+    topic: str
+    column: str
+    quantity: Quantity
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """The columns of recordings with one layout.
+
+    Parameters
+    ----------
+    sensors, actions
+        In the order of the recipe, then of the file.
+    reward
+        Rewards, if any.
+    times
+        Column with stamps by topic, and its unit.
+    labels
+        Those of the recipe's label columns that there are, by their text in the recipe.
+    unused
+        Names that no line of the recipe names.
+    """
+
+    sensors: tuple[ChosenColumn, ...]
+    actions: tuple[ChosenColumn, ...]
+    reward: ChosenColumn | None
+    times: dict[str, ChosenColumn]
+    labels: dict[str, ChosenColumn]
+    unused: tuple[str, ...]
+
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """Topics with sensors, actions or rewards, that of the first sensor first."""
+        columns = (*self.sensors, *self.actions, *([self.reward] if self.reward else ()))
+        return tuple(dict.fromkeys(column.topic for column in columns))
+
+
+Layout = tuple[tuple[str, tuple[str, ...], str], ...]
+"""Topics of a recording with their columns and their column of seconds."""
+
+
+def layout_of(recording: Recording) -> Layout:
+    """Return what decides which columns a recipe chooses."""
+    return tuple((name, topic.names, topic.time) for name, topic in recording.topics.items())
+
+
+def named_columns(layout: Layout) -> list[str]:
+    """Return the columns of a layout as a recipe names them, without their units."""
+    return [_aliases(topic, name)[-1] for topic, names, _ in layout for name in names]
+
+
+def split_unit(text: str) -> tuple[str, str]:
+    """Return name and unit of a column; digits in brackets are an index, not a unit.
+
+    >>> split_unit("q1[rad]"), split_unit("q[0]")
+    (('q1', 'rad'), ('q[0]', ''))
+    """
+    match = _UNIT.fullmatch(text.strip())
+    if match and not match[2].isdigit():
+        return match[1], match[2]
+    return text.strip(), ""
+
+
+def find_columns(layout: Layout, text: str) -> list[ChosenColumn]:
+    """Return the columns that a text of a recipe names, none where there are none.
+
+    Raises
+    ------
+    UsageError
+        When a renamed column is not exactly one, or the file has another unit.
+    """
+    new, equals, pattern = text.partition("=")
+    columns = _matches(layout, text)
+    if not columns and equals:
+        columns = _matches(layout, pattern)
+        if len(columns) > 1:
+            raise UsageError(f"{text!r} renames {len(columns)} columns, expected exactly one")
+        name, unit = _named_unit(new)
+        columns = [
+            ChosenColumn(c.topic, c.column, Quantity(name, unit or c.quantity.unit))
+            for c in columns
+        ]
+    return columns
+
+
+def select_columns(layout: Layout, recipe: Recipe, source: str) -> Selection:
+    """Return the columns that a recipe names among those of a recording.
+
+    Parameters
+    ----------
+    layout
+        Topics and their columns.
+    recipe
+        The recipe.
+    source
+        What messages call the recording.
+
+    Returns
+    -------
+    Selection
+
+    Raises
+    ------
+    UnknownNameError
+        When a sensor, an action or the stamps are not there.
+    UsageError
+        When no sensor is chosen, or two have one name.
+    """
+    by_prefix = not recipe.sensors
+    if by_prefix:
+        sensors, actions, rewards = _by_prefix(layout, source, explicit=bool(recipe.actions))
+    else:
+        sensors, actions, rewards = _listed(layout, recipe.sensors, source), [], []
+    if recipe.actions:
+        actions = _listed(layout, recipe.actions, source)
+    if recipe.reward:
+        rewards = _listed(layout, (recipe.reward,), source)
+    for kind, columns in (("sensors", sensors), ("actions", actions)):
+        _check_distinct(source, kind, columns)
+    tables = [recipe.nominal.where, *(table.where for table in recipe.anomalous.values())]
+    others = [recipe.outcome, recipe.kinds, recipe.task, *(key for t in tables for key in t)]
+    fields = [column for text in filter(None, others) for column in find_columns(layout, text)]
+    labels = {
+        text: column for text in recipe.label_columns for column in find_columns(layout, text)[:1]
+    }
+    used = [*sensors, *actions, *rewards[:1], *labels.values()]
+    times = _times(layout, dict.fromkeys(column.topic for column in used), recipe.time, source)
+    used += fields
+    named = {(c.topic, c.column) for c in (*used, *times.values())}
+    unused = tuple(
+        _aliases(topic, name)[-1]
+        for topic, columns, _ in layout
+        for name in columns
+        if (topic, name) not in named
+    )
+    if by_prefix:
+        _check_spelling(source, unused)
+    reward = rewards[0] if rewards else None
+    return Selection(tuple(sensors), tuple(actions), reward, times, labels, unused)
+
+
+def unnamed_columns(layout: Layout, recipe: Recipe) -> tuple[str, ...]:
+    """Return the columns that no key of a recipe without sensors names; none with ``obs:`` ones."""
+    names = [(topic, name) for topic, columns, _ in layout for name in columns]
+    if any((match := _PREFIX.match(name)) and match[1].lower() == "obs" for _, name in names):
+        return ()
+    keys = (recipe.reward, recipe.time, recipe.outcome, recipe.kinds, recipe.task)
+    texts = [*recipe.actions, *recipe.label_columns, *filter(None, keys)]
+    named = {(c.topic, c.column) for text in texts for c in find_columns(layout, text)}
+    return tuple(
+        f"{topic}.{name}" if topic else name for topic, name in names if (topic, name) not in named
+    )
+
+
+def _by_prefix(
+    layout: Layout, source: str, *, explicit: bool
+) -> tuple[list[ChosenColumn], list[ChosenColumn], list[ChosenColumn]]:
+    """Return the columns ``obs:NAME[UNIT]``, ``action:NAME[UNIT]`` and ``reward``."""
+    chosen: dict[str, list[ChosenColumn]] = {"obs": [], "action": [], "reward": []}
+    for topic, columns, _ in layout:
+        for name in columns:
+            match = _PREFIX.match(name)
+            kind = match[1].lower() if match else name.strip().lower()
+            if match or kind == "reward":
+                label, unit = _named_unit(name[match.end() :] if match else name)
+                chosen[kind].append(ChosenColumn(topic, name, Quantity(label, unit or "1")))
+    if not chosen["obs"]:
+        _check_spelling(source, [name for _, columns, _ in layout for name in columns])
+        names = ", ".join(named_columns(layout))
+        raise UsageError(
+            f"{source} has the columns {names or 'none'}: none is called "
+            "obs:NAME[UNIT], so name the sensors in a recipe (sensors = [...]), actions, too"
+        )
+    return chosen["obs"], [] if explicit else chosen["action"], chosen["reward"]
+
+
+def _check_spelling(source: str, names: Iterable[str]) -> None:
+    for name in names:
+        if right := nearest_spelling(name):
+            raise UsageError(
+                f"{source}: column {name!r} is neither obs:NAME[UNIT] nor action:NAME[UNIT]: "
+                f"rename it {right!r}, or name the sensors and actions in a recipe"
+            )
+
+
+def _listed(layout: Layout, texts: Sequence[str], source: str) -> list[ChosenColumn]:
+    """Return the columns that texts name, each once."""
+    chosen: dict[tuple[str, str], ChosenColumn] = {}
+    for text in texts:
+        columns = find_columns(layout, text)
+        if not columns:
+            name = split_unit(text.rpartition("=")[2])[0]
+            raise UnknownNameError(f"column of {source}", name, named_columns(layout))
+        for column in columns:
+            chosen.setdefault((column.topic, column.column), column)
+    return list(chosen.values())
+
+
+def _check_distinct(source: str, kind: str, columns: Sequence[ChosenColumn]) -> None:
+    names = [column.quantity.name for column in columns]
+    if double := [name for name in names if names.count(name) > 1]:
+        raise UsageError(f"{source} has two {kind} named {double[0]!r}: rename one, 'new = old'")
+
+
+def _times(
+    layout: Layout, topics: Iterable[str], text: str, source: str
+) -> dict[str, ChosenColumn]:
+    """Return the columns with stamps by topic, as the recipe names them, else as the format."""
+    columns = {column.topic: column for column in find_columns(layout, text)} if text else {}
+    for topic, names, _ in layout if text else ():
+        # One name holds for all topics.
+        for column in find_columns((("", names, ""),), text):
+            columns.setdefault(topic, dataclasses.replace(column, topic=topic))
+    defined = {
+        topic: ChosenColumn(topic, time, Quantity(time, "s")) for topic, _, time in layout if time
+    }
+    if text and not columns:
+        raise UnknownNameError(f"column of {source}", split_unit(text)[0], named_columns(layout))
+    chosen = defined | columns
+    if text and (without := [topic for topic in topics if topic not in chosen]):
+        raise TrajectoryError(f"{source}: topic {without[0]!r} has no column {text!r}, its stamps")
+    return {topic: chosen[topic] for topic in topics if topic in chosen}
+
+
+def _named_unit(text: str) -> tuple[str, str]:
+    """Return name and unit where brackets hold a unit for certain, digits too."""
+    match = _UNIT.fullmatch(text.strip())
+    return (match[1], match[2]) if match else (text.strip(), "")
+
+
+def _aliases(topic: str, column: str) -> list[str]:
+    """Return the names that a column goes by, the whole one first, without unit last."""
+    prefix = f"{topic}." if topic else ""
+    match = _PREFIX.match(column)
+    bare = column[match.end() :] if match else column
+    name = _named_unit(bare)[0] if match else split_unit(bare)[0]
+    return [*dict.fromkeys(prefix + alias.strip() for alias in (column, bare, name))]
+
+
+def _matches(layout: Layout, text: str) -> list[ChosenColumn]:
+    """Return the columns that a glob without a new name matches, with the unit it names."""
+    whole = text.strip()
+    readings = dict.fromkeys([(whole, ""), split_unit(whole), _named_unit(whole)])
+    if {*whole} & {*"*?"}:  # columns with the unit and without it
+        readings = dict.fromkeys([split_unit(whole), (whole, ""), _named_unit(whole)])
+    for pattern, unit in readings:
+        glob = _glob(pattern)
+        columns = [
+            _with_unit(topic, name, unit)
+            for topic, names, _ in layout
+            for name in names
+            if any(glob.fullmatch(alias) for alias in _aliases(topic, name))
+        ]
+        if columns:
+            return columns
+    return []
+
+
+def _with_unit(topic: str, column: str, unit: str) -> ChosenColumn:
+    name = _aliases(topic, column)[-1]
+    match = _PREFIX.match(column)
+    known = (_named_unit if match else split_unit)(column)[1]
+    if unit not in {"", known} and known not in {"", "1"}:
+        raise UsageError(
+            f"column {column!r} is in {known}, and the recipe says {unit}: values are not converted"
+        )
+    return ChosenColumn(topic, column, Quantity(name, unit or known or "1"))
+
+
+def matches_any(patterns: Iterable[str], names: Sequence[str], kind: str = "") -> bool:
+    """Tell whether globs match any of some names; with a kind, each has to: an error if not."""
+    for pattern in patterns:
+        matches = any(_glob(pattern.strip()).fullmatch(name) for name in names)
+        if matches and not kind:
+            return True
+        if not matches and kind:
+            raise UnknownNameError(kind, pattern, names)
+    return False
+
+
+def _glob(pattern: str) -> re.Pattern[str]:
+    return re.compile(re.escape(pattern).replace(r"\*", ".*").replace(r"\?", "."))
