@@ -17,11 +17,11 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from oodd_live import Watchdog
 from tabulate import tabulate
 
 from oodd_eval import load_split
 from oodd_eval.data.facts import ENVIRONMENTS
-from oodd_eval.live import Watchdog
 from oodd_eval.names import select
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))

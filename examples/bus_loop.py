@@ -17,11 +17,11 @@ import time
 
 import gymnasium
 import numpy as np
+from oodd_live import TerminalMonitor, Watchdog
 from oodd_recording.policies import load_policy
 
 from oodd_eval import load_split
 from oodd_eval.errors import OoddError
-from oodd_eval.live import TerminalMonitor, Watchdog
 
 RATE = 50
 FAULTS = ("silent", "stuck", "nan", "skipping")

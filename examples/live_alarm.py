@@ -20,10 +20,10 @@ from pathlib import Path
 
 import gymnasium
 import numpy as np
+from oodd_live import TerminalMonitor, Watchdog, WatchdogWrapper
 from oodd_recording.policies import load_policy
 
 from oodd_eval import load_split
-from oodd_eval.live import TerminalMonitor, Watchdog, WatchdogWrapper
 
 HEAVIER = {"masspole": 0.4, "length": 1.0}
 """Values after the onset; nominally 0.1 kg and 0.5 m (half of the pole)."""

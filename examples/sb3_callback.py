@@ -1,6 +1,6 @@
 """Readings of a watchdog in the logs of stable-baselines3, in training and in evaluation.
 
-The environments are wrapped in `oodd_eval.live.WatchdogWrapper`, so that the info of each step has
+The environments are wrapped in `oodd_live.WatchdogWrapper`, so that the info of each step has
 a reading. Then ::
 
     from stable_baselines3 import PPO

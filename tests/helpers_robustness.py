@@ -56,7 +56,7 @@ import sys
 from pathlib import Path
 from oodd_eval import load_split
 from oodd_eval.errors import OoddError
-from oodd_eval.live import Watchdog
+from oodd_live import Watchdog
 data, path = load_split("split").environment("cartpole"), Path(sys.argv[2])
 try:
     if path.exists():

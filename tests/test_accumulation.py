@@ -6,11 +6,11 @@ from typing import get_args
 
 import numpy as np
 import pytest
+from oodd_live import Watchdog
 
 from oodd_eval import Trajectory
 from oodd_eval.cli.main import main
 from oodd_eval.errors import UsageError
-from oodd_eval.live import Watchdog
 from oodd_eval.metrics.accumulation import (
     BETS,
     SHIFT,

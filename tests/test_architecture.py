@@ -70,10 +70,7 @@ def test_the_core_imports_no_heavy_library_and_no_other_package():
     others = set(SOURCES) - {"oodd_eval"}
 
     def forbidden(path):
-        simulators = SIMULATORS
-        if path == ROOT / "oodd_eval" / "live" / "wrappers.py":
-            simulators = SIMULATORS - {"gymnasium"}
-        return {*imported(path)} & (HEAVY | others | simulators)
+        return {*imported(path)} & (HEAVY | others | SIMULATORS)
 
     assert not wrong(CORE, forbidden)
 

@@ -8,11 +8,11 @@ import json
 
 import numpy as np
 import pytest
+from oodd_live import Watchdog
 
 from oodd_eval import load_split
 from oodd_eval.cli.main import main
 from oodd_eval.errors import UsageError
-from oodd_eval.live import Watchdog
 from oodd_eval.metrics.alarms import GuaranteedAlarm
 
 ROWS = 60

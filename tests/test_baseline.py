@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from helpers_logs import UNPAIRED, log_episode, make_log_split, write_log_split
 from helpers_plugins import install
+from oodd_live import Watchdog
 
 from oodd_eval import DetectorSpec, Trajectory, load_split
 from oodd_eval.data.baseline import Baseline
 from oodd_eval.data.parts import CALIBRATION, TWINS
 from oodd_eval.errors import TrajectoryError
-from oodd_eval.live import Watchdog
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.plugins.isolation.child import Limits
 from oodd_eval.scoring.plan import make_plan

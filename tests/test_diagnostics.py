@@ -5,9 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from oodd_live import Reading
 from rosbags.typesys import Stores, get_typestore
-
-from oodd_eval.live import Reading
 
 QUIET = Reading(7, 0.5, 1.25, 3.0, False, {}, None, {})
 TYPES = get_typestore(Stores.ROS2_HUMBLE).types

@@ -128,7 +128,7 @@ KNOWN = {
 
                 import numpy as np
 
-                from oodd_eval.live import Watchdog
+                from oodd_live import Watchdog
 
                 rng = np.random.default_rng(0)
                 for folder, shift in (("logs", 9), ("today", 0)):

@@ -10,11 +10,12 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from oodd_live import Watchdog
 from oodd_logs.importing import import_data
 from oodd_logs.readers import quantity
 from oodd_logs.readers.minari import export
 
-from oodd_eval import evaluate, live, load_split
+from oodd_eval import evaluate, load_split
 from oodd_eval.cli.main import main
 from oodd_eval.data.facts import Quantity
 from oodd_eval.errors import TrajectoryError, UsageError
@@ -178,7 +179,7 @@ def test_without_tests_it_is_a_split_to_watch_with(tmp_path, capsys):
     assert main([*run, "--output", str(tmp_path / "r")]) == 4
     assert "no anomalous episodes of pump" in capsys.readouterr().err
     nominal = [*data.train, *data.calibration]
-    watchdog = live.Watchdog.fit("mahalanobis", nominal, data.calibration, 0.5)
+    watchdog = Watchdog.fit("mahalanobis", nominal, data.calibration, 0.5)
     assert watchdog.update(data.train[0].observations[0]).t == 0
 
 

@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 from helpers_live import FAULTS, SENSOR_FAULTS, first_alarm, rows_of, walk, with_fault
+from oodd_live import Watchdog
+from oodd_live.stream import Stream, StreamLimits
 
 from oodd_eval import Trajectory, load_split
 from oodd_eval.errors import UsageError
-from oodd_eval.live import Watchdog
-from oodd_eval.live.stream import Stream, StreamLimits
 
 pytestmark = pytest.mark.slow
 

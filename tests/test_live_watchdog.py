@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers_live import first_alarm, rows_of, walk
+from oodd_live import Reading, Watchdog
 
 from oodd_eval import Trajectory
 from oodd_eval.errors import (
@@ -16,7 +17,6 @@ from oodd_eval.errors import (
     TrajectoryError,
     UsageError,
 )
-from oodd_eval.live import Reading, Watchdog
 from oodd_eval.metrics.alarms import GuaranteedAlarm
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.plugins.state import PackedState, read_state, write_state

@@ -10,18 +10,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from oodd_live import Reading, TerminalMonitor, Watchdog
 from rich.console import Console
 
 from oodd_eval import load_split
 from oodd_eval.errors import UsageError
-from oodd_eval.live import Reading, TerminalMonitor, Watchdog
 
 gymnasium = pytest.importorskip("gymnasium", reason="needs the extra gym")
 from gymnasium.utils.env_checker import check_env  # noqa: E402
 from gymnasium.vector import AutoresetMode  # noqa: E402
-
-from oodd_eval.live import VectorWatchdogWrapper, WatchdogWrapper  # noqa: E402
-from oodd_eval.live.wrappers import as_row  # noqa: E402
+from oodd_live import VectorWatchdogWrapper, WatchdogWrapper  # noqa: E402
+from oodd_live.wrappers import as_row  # noqa: E402
 
 ROOT = Path(__file__).parents[1]
 

@@ -130,7 +130,7 @@ def test_the_run_finds_the_slip(newcomer):
 WATCH = """
 import json, shutil
 from oodd_eval import load_split
-from oodd_eval.live import Watchdog
+from oodd_live import Watchdog
 arm = load_split("arm").environment("arm")
 watchdog = Watchdog.fit("mahalanobis", arm, alpha=0.1)
 shutil.rmtree("watchdog", ignore_errors=True)

@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
+from oodd_live import Watchdog
 from oodd_logs import scan_episodes
-
-from oodd_eval.live import Watchdog
 
 MIXING = np.random.default_rng(7).normal(size=(3, 8)) / 2
 SENSORS = [f"joint {i}" for i in range(8)]

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 from helpers_logs import UNPAIRED, log_episode, log_parts, make_log_split, write_log_split
+from oodd_live import Watchdog
 from scipy.stats import binom, spearmanr
 
 from oodd_eval import Trajectory, evaluate, load_results, load_split
@@ -15,7 +16,6 @@ from oodd_eval.data.baseline import Baseline, episode_means
 from oodd_eval.data.offsets import fit_offsets
 from oodd_eval.data.parts import lengths_of, parts_of
 from oodd_eval.errors import PromiseWarning, UsageError
-from oodd_eval.live import Watchdog
 from oodd_eval.metrics import promise
 from oodd_eval.metrics.alarms import (
     Calibration,

@@ -9,6 +9,8 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+from oodd_live import Watchdog
+from oodd_live.handle import DetectorHandle
 from oodd_logs import scan_episodes
 from oodd_logs.episodes import EVERY, Episode, read_every_episode
 from oodd_logs.recipe import Recipe
@@ -19,8 +21,6 @@ from oodd_logs.scanning.viewers import write_mcap, write_rerun
 
 from oodd_eval.cli.main import main
 from oodd_eval.errors import MissingExtraError, UsageError
-from oodd_eval.live import Watchdog
-from oodd_eval.live.handle import DetectorHandle
 from oodd_eval.metrics.binomial import clopper_pearson
 
 ROOT = Path(__file__).parents[1]

@@ -7,13 +7,13 @@ from typing import Final
 
 import click
 import numpy as np
+from oodd_live.watchdog import Watchdog
 from rich.text import Text
 from tabulate import tabulate
 
 from oodd_eval.cli import COUNT, FILE, PARAM, PARAMETER, Name, Options, command, refuse
 from oodd_eval.cli.console import make_console
 from oodd_eval.data.files import write_text
-from oodd_eval.live.watchdog import Watchdog
 from oodd_eval.names import counted
 from oodd_eval.plugins.parameters import parameters_by_detector
 from oodd_eval.prose import print_prose

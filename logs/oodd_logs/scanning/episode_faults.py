@@ -9,9 +9,9 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from oodd_live.stream import FAR, Stream, StreamLimits
 
 from oodd_eval.data.trajectory import Trajectory
-from oodd_eval.live.stream import FAR, Stream, StreamLimits
 from oodd_logs.episodes import Episode
 from oodd_logs.scanning.limits import SHORTEST
 from oodd_logs.scanning.outliers import ODD_SHARE, Tail

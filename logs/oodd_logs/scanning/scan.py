@@ -13,14 +13,14 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from oodd_live.handle import DetectorHandle
+from oodd_live.nominal import sensor_names
+from oodd_live.watchdog import Watchdog
 
 from oodd_eval.data.baseline import Baseline
 from oodd_eval.data.bounded import without_nan
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import ContractError, OoddError, UnknownNameError, UsageError
-from oodd_eval.live.handle import DetectorHandle
-from oodd_eval.live.nominal import sensor_names
-from oodd_eval.live.watchdog import Watchdog
 from oodd_eval.metrics.accumulation import AlarmKind, Ranks
 from oodd_eval.metrics.alarms import GuaranteedAlarm
 from oodd_eval.metrics.cusum import Standardization

@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from oodd_live.reading import as_nanoseconds
 
 from oodd_eval.data.bounded import without_nan
 from oodd_eval.data.files import replacing
 from oodd_eval.errors import MissingExtraError
-from oodd_eval.live.reading import as_nanoseconds
 from oodd_logs.scanning.scan import Scan, ScannedEpisode
 
 _EXTRA: Final = "pip install 'oodd-eval[viewers]'"

@@ -11,7 +11,7 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from oodd_eval.live.reading import Reading
+from oodd_live.reading import Reading
 
 BARS: Final = " ▁▂▃▄▅▆▇█"
 HISTORY: Final = 60

@@ -7,10 +7,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from oodd_eval.live.reading import Reading
-    from oodd_eval.live.terminal import TerminalMonitor
-    from oodd_eval.live.watchdog import Watchdog
-    from oodd_eval.live.wrappers import VectorWatchdogWrapper, WatchdogWrapper
+    from oodd_live.reading import Reading
+    from oodd_live.terminal import TerminalMonitor
+    from oodd_live.watchdog import Watchdog
+    from oodd_live.wrappers import VectorWatchdogWrapper, WatchdogWrapper
 
 __all__ = ["Reading", "TerminalMonitor", "VectorWatchdogWrapper", "Watchdog", "WatchdogWrapper"]
 

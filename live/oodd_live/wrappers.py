@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oodd_eval.errors import MissingExtraError, UsageError
-from oodd_eval.live.watchdog import Watchdog
+from oodd_live.watchdog import Watchdog
 
 try:
     import gymnasium

@@ -20,15 +20,15 @@ from oodd_eval.errors import (
     TrajectoryError,
     UsageError,
 )
-from oodd_eval.live.handle import DetectorHandle, streaming
-from oodd_eval.live.nominal import Episode, Nominal, NominalData
-from oodd_eval.live.reading import EpisodeAlarm, Reading, RunLength
-from oodd_eval.live.stream import ACTION, MARGIN, OBSERVATION, Stream, StreamFault, StreamLimits
 from oodd_eval.metrics.accumulation import AlarmKind, basis_from, basis_of
 from oodd_eval.metrics.alarms import Calibration, GuaranteedAlarm, Monitor, least_episodes, too_few
 from oodd_eval.names import check_known, counted
 from oodd_eval.plugins.contract import AnyDetector, StorableDetector, copied
 from oodd_eval.plugins.state import pack, read_state, write_state
+from oodd_live.handle import DetectorHandle, streaming
+from oodd_live.nominal import Episode, Nominal, NominalData
+from oodd_live.reading import EpisodeAlarm, Reading, RunLength
+from oodd_live.stream import ACTION, MARGIN, OBSERVATION, Stream, StreamFault, StreamLimits
 
 KIND: Final = "watchdog/3"
 DETECTOR: Final = "detector."
