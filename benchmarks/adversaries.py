@@ -31,11 +31,11 @@ sys.path[:] = [str(TESTS), *(path for path in sys.path if path != HERE)]  # it h
 
 import adversaries  # noqa: E402
 from helpers_plugins import install_adversaries  # noqa: E402
+from oodd_leaderboard.verify.rerun import differences  # noqa: E402
 from oodd_recording.build import build_split, digest_of_bits  # noqa: E402
 
 from oodd_eval.data.facts import CUSTOM_SEED_BASES, SPLITS, SplitDefinition  # noqa: E402
 from oodd_eval.data.split import load_split, split_places  # noqa: E402
-from oodd_eval.leaderboard.verify.rerun import differences  # noqa: E402
 from oodd_eval.plugins.discovery import discover  # noqa: E402
 from oodd_eval.plugins.isolation.child import Limits  # noqa: E402
 from oodd_eval.results.board import Board, grouped  # noqa: E402

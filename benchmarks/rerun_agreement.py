@@ -20,11 +20,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from oodd_leaderboard.verify.rerun import COMPARED, differences
 from oodd_recording.build import build_split, digest_of_bits
 
 from oodd_eval.api import evaluate
 from oodd_eval.data.facts import ENVIRONMENTS, SPLITS
-from oodd_eval.leaderboard.verify.rerun import COMPARED, differences
 from oodd_eval.metrics.catalogue import RANKING
 from oodd_eval.names import select
 from oodd_eval.results.board import grouped

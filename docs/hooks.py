@@ -18,12 +18,12 @@ from mkdocs.structure import StructureItem
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.nav import Navigation
 from mkdocs.structure.pages import Page
+from oodd_leaderboard import site
+from oodd_leaderboard.build import CELLS, cells
+from oodd_leaderboard.entry import read_entries, sections, suite_sections
 
 from oodd_eval._version import repository
 from oodd_eval.cli.main import PROGRAM
-from oodd_eval.leaderboard import site
-from oodd_eval.leaderboard.build import CELLS, cells
-from oodd_eval.leaderboard.entry import read_entries, sections, suite_sections
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = "docs/"

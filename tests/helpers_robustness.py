@@ -43,7 +43,7 @@ sys.exit(main.main())
 import dataclasses, sys, types
 from pathlib import Path
 from oodd_eval.cli.main import main
-from oodd_eval.leaderboard.entry import read_entry
+from oodd_leaderboard.entry import read_entry
 from oodd_recording import rerun
 rerun.secrets = types.SimpleNamespace(token_hex=lambda count: "5b" * count)
 small = {"name": "small", "train": 2, "calibration": 20, "test": 2, "episode_cap": 60}

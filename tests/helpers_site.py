@@ -7,10 +7,8 @@ from pathlib import Path
 
 import numpy as np
 from helpers_records import PAIRED, make_record
-
-from oodd_eval.data.condition import rungs_of
-from oodd_eval.leaderboard import site
-from oodd_eval.leaderboard.entry import (
+from oodd_leaderboard import site
+from oodd_leaderboard.entry import (
     EntryInfo,
     Grant,
     SubmittedEntry,
@@ -21,7 +19,9 @@ from oodd_eval.leaderboard.entry import (
     suite_sections,
     write_grants,
 )
-from oodd_eval.leaderboard.site.data import site_data
+from oodd_leaderboard.site.data import site_data
+
+from oodd_eval.data.condition import rungs_of
 from oodd_eval.metrics.auc import AlarmRule, Contribution
 from oodd_eval.metrics.catalogue import GUARANTEED, RANKING
 from oodd_eval.metrics.curves import Sweep, cell_curves, thresholds

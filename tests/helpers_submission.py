@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from helpers_split import make_split
+from oodd_leaderboard.submit import Statement, submit
+from oodd_leaderboard.verify import verify_entry
 
 from oodd_eval.api import evaluate
 from oodd_eval.data import files
-from oodd_eval.leaderboard.submit import Statement, submit
-from oodd_eval.leaderboard.verify import verify_entry
 from oodd_eval.metrics.auc import Contribution
 from oodd_eval.metrics.bootstrap import drawn_cell, mean_interval
 from oodd_eval.metrics.catalogue import metric_info

@@ -4,12 +4,12 @@ import shutil
 import subprocess
 
 import pytest
+from oodd_leaderboard import build as leaderboard_build
+from oodd_leaderboard.commands.entries import changes_against
+from oodd_leaderboard.submit import Statement, submit
 
-from oodd_eval.cli.leaderboard import changes_against
 from oodd_eval.cli.main import main
 from oodd_eval.errors import UsageError
-from oodd_eval.leaderboard import build as leaderboard_build
-from oodd_eval.leaderboard.submit import Statement, submit
 
 
 class Repository:

@@ -9,12 +9,12 @@ from itertools import zip_longest
 from pathlib import Path
 
 import pytest
+from oodd_leaderboard import build as leaderboard_build
+from oodd_leaderboard.entry import read_entries, sections, suite_sections
+from oodd_leaderboard.published import PUBLISHED, board_of, placement, read_published
+from oodd_leaderboard.verify import verify
 
 from oodd_eval.data.files import read_text
-from oodd_eval.leaderboard import build as leaderboard_build
-from oodd_eval.leaderboard.entry import read_entries, sections, suite_sections
-from oodd_eval.leaderboard.published import PUBLISHED, board_of, placement, read_published
-from oodd_eval.leaderboard.verify import verify
 
 BOARD = Path(__file__).parents[1] / "leaderboard"
 

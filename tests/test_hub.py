@@ -4,11 +4,11 @@ import dataclasses
 
 import pytest
 import yaml
+from oodd_leaderboard import hub
+from oodd_leaderboard.entry import read_entry
 
 from oodd_eval.cli import main as cli
 from oodd_eval.errors import UsageError
-from oodd_eval.leaderboard import hub
-from oodd_eval.leaderboard.entry import read_entry
 from oodd_eval.results.board import boards
 from oodd_eval.results.identity import Setting
 

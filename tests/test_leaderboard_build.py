@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 from helpers_records import PAIRED, example, make_record
 from helpers_site import submitted as entry
+from oodd_leaderboard import build as leaderboard_build
+from oodd_leaderboard.build import cells, page
+from oodd_leaderboard.entry import read_entries, sections
+from oodd_leaderboard.published import PUBLISHED
 
 from oodd_eval.cli.main import main
 from oodd_eval.data.facts import ENVIRONMENTS, SPLITS, TABLE1
 from oodd_eval.data.files import decompress
 from oodd_eval.data.split import published_digests
 from oodd_eval.errors import ResultsError
-from oodd_eval.leaderboard import build as leaderboard_build
-from oodd_eval.leaderboard.build import cells, page
-from oodd_eval.leaderboard.entry import read_entries, sections
-from oodd_eval.leaderboard.published import PUBLISHED
 from oodd_eval.metrics import catalogue
 from oodd_eval.metrics.catalogue import UNDEFINED
 from oodd_eval.results import board as results_board

@@ -9,14 +9,10 @@ import numpy as np
 import pytest
 from helpers_records import make_record
 from helpers_site import submitted
-
-from oodd_eval.cli import board as board_command
-from oodd_eval.cli.main import main
-from oodd_eval.data.files import decompress
-from oodd_eval.errors import ResultsError, UsageError
-from oodd_eval.leaderboard import published
-from oodd_eval.leaderboard.entry import SuiteSection, sections
-from oodd_eval.leaderboard.published import (
+from oodd_leaderboard import published
+from oodd_leaderboard.commands import board as board_command
+from oodd_leaderboard.entry import SuiteSection, sections
+from oodd_leaderboard.published import (
     board_of,
     neighbours,
     neighbours_notes,
@@ -25,6 +21,10 @@ from oodd_eval.leaderboard.published import (
     rankings,
     read_published,
 )
+
+from oodd_eval.cli.main import main
+from oodd_eval.data.files import decompress
+from oodd_eval.errors import ResultsError, UsageError
 from oodd_eval.results.board import Board
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.tables import Table

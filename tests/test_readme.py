@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import yaml
 from helpers_docs import parse
+from oodd_leaderboard.entry import read_entries
 
-from oodd_eval.leaderboard.entry import read_entries
 from oodd_eval.results.directory import ResultsDirectory
 
 ROOT = Path(__file__).parents[1]

@@ -8,6 +8,10 @@ from types import SimpleNamespace
 
 import pytest
 from helpers_submission import Draft
+from oodd_leaderboard.entry import read_entry
+from oodd_leaderboard.submit import Statement, submit
+from oodd_leaderboard.verify import verify_entry
+from oodd_leaderboard.verify.rerun import ORDER, read_order
 from oodd_recording import rerun as recording
 from oodd_recording.build import build_split, digest_of_bits
 from oodd_recording.rerun import check_installed, chosen, definition_of, draw, earlier, plan_of
@@ -18,10 +22,6 @@ from oodd_eval.cli import main as cli
 from oodd_eval.data.facts import SPLITS
 from oodd_eval.data.split import load_split
 from oodd_eval.errors import ResultsError, UsageError
-from oodd_eval.leaderboard.entry import read_entry
-from oodd_eval.leaderboard.submit import Statement, submit
-from oodd_eval.leaderboard.verify import verify_entry
-from oodd_eval.leaderboard.verify.rerun import ORDER, read_order
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.plugins.isolation.sandbox import require_sandbox
 from oodd_eval.results.directory import ResultsDirectory

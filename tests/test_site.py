@@ -9,15 +9,9 @@ from pathlib import Path
 import helpers_site
 import numpy as np
 import pytest
-
-from oodd_eval import __version__
-from oodd_eval.data.condition import rungs_of
-from oodd_eval.data.facts import ENVIRONMENTS, TABLE1
-from oodd_eval.data.split import load_split
-from oodd_eval.errors import ResultsError
-from oodd_eval.leaderboard import site
-from oodd_eval.leaderboard.entry import read_entries, sections
-from oodd_eval.leaderboard.site.data import (
+from oodd_leaderboard import site
+from oodd_leaderboard.entry import read_entries, sections
+from oodd_leaderboard.site.data import (
     WITH_INTERVALS,
     gridded,
     part_name,
@@ -26,6 +20,12 @@ from oodd_eval.leaderboard.site.data import (
     shown_episodes,
     site_data,
 )
+
+from oodd_eval import __version__
+from oodd_eval.data.condition import rungs_of
+from oodd_eval.data.facts import ENVIRONMENTS, TABLE1
+from oodd_eval.data.split import load_split
+from oodd_eval.errors import ResultsError
 from oodd_eval.metrics.catalogue import METRICS, NAMES, metric_info
 from oodd_eval.results.curve_file import read_curves
 
@@ -159,7 +159,7 @@ def test_every_static_file_is_used():
 
 
 def test_importing_the_harness_does_not_import_the_site():
-    site = "oodd_eval.leaderboard.site"
+    site = "oodd_leaderboard.site"
     code = f"import sys, oodd_eval, oodd_eval.cli.main; sys.exit({site!r} in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 

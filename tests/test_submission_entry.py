@@ -276,7 +276,7 @@ def test_tampered_files_are_refused_by_name(submissions, tmp_path, case):
 
 
 def test_an_entry_that_is_a_link_is_refused(submissions, tmp_path):
-    from oodd_eval.leaderboard.verify import verify_entry
+    from oodd_leaderboard.verify import verify_entry
 
     link = tmp_path / submissions.plain.name
     link.symlink_to(submissions.plain)
@@ -284,7 +284,7 @@ def test_an_entry_that_is_a_link_is_refused(submissions, tmp_path):
 
 
 def test_all_files_together_are_bounded(submissions, tmp_path, monkeypatch):
-    from oodd_eval.leaderboard.verify import files
+    from oodd_leaderboard.verify import files
 
     monkeypatch.setattr(files, "MOST_TOTAL_BYTES", 1000)
     draft = Draft(submissions.plain, tmp_path)

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import pytest
 from helpers_submission import Draft, assert_refused
+from oodd_leaderboard.verify import recompute
+from oodd_leaderboard.verify.files import MOST_PROBLEMS, Findings
 
-from oodd_eval.leaderboard.verify import recompute
-from oodd_eval.leaderboard.verify.files import MOST_PROBLEMS, Findings
 from oodd_eval.metrics import catalogue
 from oodd_eval.results.record import Record
 

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import pytest
 from helpers_split import make_split
+from oodd_leaderboard.entry import read_entries
+from oodd_leaderboard.submit import with_curves
 
 from oodd_eval.api import evaluate
 from oodd_eval.cli import main as cli
 from oodd_eval.data import files as packed
-from oodd_eval.leaderboard.entry import read_entries
-from oodd_eval.leaderboard.submit import with_curves
 from oodd_eval.results.directory import ResultsDirectory
 
 pytestmark = pytest.mark.slow
@@ -140,7 +140,7 @@ def test_packing_gives_the_same_bytes_and_no_name_or_time():
 
 
 def test_an_entry_says_how_large_it_is(many, tmp_path, monkeypatch, capsys):
-    from oodd_eval.leaderboard import submit as submission
+    from oodd_leaderboard import submit as submission
 
     monkeypatch.setattr(submission, "LARGE", 1000)
     assert submit(many, tmp_path, "--complete") == 0

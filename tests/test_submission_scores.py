@@ -187,7 +187,7 @@ def test_tampered_curves_are_refused_by_their_field(submissions, tmp_path, case)
 
 
 def test_scores_confirm_every_metric(submissions):
-    from oodd_eval.leaderboard.verify import verify_entry
+    from oodd_leaderboard.verify import verify_entry
 
     verdict = verify_entry(submissions.full, split=submissions.split)
     assert verdict.ok

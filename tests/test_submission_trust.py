@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from helpers_split import make_split
 from helpers_submission import Draft, assert_refused
+from oodd_leaderboard.entry import GRANTS, read_entry
+from oodd_leaderboard.submit import Statement, submit
+from oodd_leaderboard.verify import grant, verify_entry
+from oodd_leaderboard.verify.rerun import Rerun, RerunDifference, RerunOrder, compare_rerun
 
 from oodd_eval.api import evaluate
 from oodd_eval.cli import main as cli
 from oodd_eval.errors import UsageError
-from oodd_eval.leaderboard.entry import GRANTS, read_entry
-from oodd_eval.leaderboard.submit import Statement, submit
-from oodd_eval.leaderboard.verify import grant, verify_entry
-from oodd_eval.leaderboard.verify.rerun import Rerun, RerunDifference, RerunOrder, compare_rerun
 from oodd_eval.results.record import Record
 
 THREE = ("cartpole", "acrobot", "hopper")

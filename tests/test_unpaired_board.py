@@ -10,6 +10,11 @@ import numpy as np
 import pytest
 from helpers_records import make_record
 from helpers_submission import Draft
+from oodd_leaderboard import published, site
+from oodd_leaderboard.build import build, differences
+from oodd_leaderboard.entry import read_entries, sections
+from oodd_leaderboard.submit import Statement, submit
+from oodd_leaderboard.verify import verify_entry
 
 from oodd_eval import evaluate
 from oodd_eval.cli.main import main
@@ -17,11 +22,6 @@ from oodd_eval.data.facts import LogFacts, Quantity
 from oodd_eval.data.layout import own_facts, write_environment, write_manifest
 from oodd_eval.data.split import Split
 from oodd_eval.errors import ResultsError, UsageError
-from oodd_eval.leaderboard import published, site
-from oodd_eval.leaderboard.build import build, differences
-from oodd_eval.leaderboard.entry import read_entries, sections
-from oodd_eval.leaderboard.submit import Statement, submit
-from oodd_eval.leaderboard.verify import verify_entry
 from oodd_eval.metrics.alarms import GuaranteedAlarm
 from oodd_eval.metrics.curves import pooled_roc
 from oodd_eval.metrics.unpaired import UnpairedScores, separability

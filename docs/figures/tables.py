@@ -14,7 +14,8 @@ import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from oodd_eval.leaderboard.entry import read_entries
+from oodd_leaderboard.entry import read_entries
+
 from oodd_eval.metrics.catalogue import metric_info
 from oodd_eval.results.board import Board, boards
 from oodd_eval.results.directory import ResultsDirectory

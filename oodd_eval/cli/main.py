@@ -52,12 +52,15 @@ DATA: Final[Commands] = {
 }
 
 LEADERBOARD: Final[Commands] = {
-    "show": ("print the published board", "oodd_eval.cli.board:show"),
-    "place": ("show where a run would stand on it", "oodd_eval.cli.board:place_run"),
-    "submit": ("write an entry from a results directory", "oodd_eval.cli.leaderboard:submit"),
-    "verify": ("check entries as data", "oodd_eval.cli.leaderboard:verify"),
+    "show": ("print the published board", "oodd_leaderboard.commands.board:show"),
+    "place": ("show where a run would stand on it", "oodd_leaderboard.commands.board:place_run"),
+    "submit": (
+        "write an entry from a results directory",
+        "oodd_leaderboard.commands.entries:submit",
+    ),
+    "verify": ("check entries as data", "oodd_leaderboard.commands.entries:verify"),
     "rerun": ("run an entry again on new seeds (extra sim)", "oodd_recording.rerun:rerun"),
-    "build": ("render tables and site from the entries", "oodd_eval.cli.leaderboard:build"),
+    "build": ("render tables and site from the entries", "oodd_leaderboard.commands.entries:build"),
 }
 
 POLICIES: Final[Commands] = {

@@ -11,6 +11,18 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import click
+from oodd_leaderboard.commands.entries import report, write_grant
+from oodd_leaderboard.verify import EntryVerdict, verify
+from oodd_leaderboard.verify.rerun import (
+    ORDER,
+    SPLIT_DIRECTORY,
+    Rerun,
+    RerunDifference,
+    RerunOrder,
+    cell_of,
+    compare_rerun,
+    read_order,
+)
 
 from oodd_eval.cli import (
     DIRECTORY,
@@ -23,24 +35,12 @@ from oodd_eval.cli import (
     limit_options,
 )
 from oodd_eval.cli.console import make_console
-from oodd_eval.cli.leaderboard import report, write_grant
 from oodd_eval.cli.plugins import discovered
 from oodd_eval.cli.terminal import TerminalReporter
 from oodd_eval.data.facts import ENVIRONMENTS, SPLITS, SplitDefinition, in_order
 from oodd_eval.data.files import find_file, write_text
 from oodd_eval.data.split import Split, load_split, split_places
 from oodd_eval.errors import UnknownNameError, UsageError
-from oodd_eval.leaderboard.verify import EntryVerdict, verify
-from oodd_eval.leaderboard.verify.rerun import (
-    ORDER,
-    SPLIT_DIRECTORY,
-    Rerun,
-    RerunDifference,
-    RerunOrder,
-    cell_of,
-    compare_rerun,
-    read_order,
-)
 from oodd_eval.metrics.catalogue import UNDEFINED, metric_info
 from oodd_eval.names import select
 from oodd_eval.plugins.discovery import Plugins

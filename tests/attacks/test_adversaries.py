@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from helpers_plugins import install_adversaries
 from helpers_split import make_split
+from oodd_leaderboard.verify.rerun import differences
 
 from oodd_eval.data.split import load_split, split_places
-from oodd_eval.leaderboard.verify.rerun import differences
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.plugins.isolation.child import Limits
 from oodd_eval.results.directory import ResultsDirectory

@@ -17,16 +17,16 @@ import pytest
 from helpers_fuzz import ANY, damaged
 from helpers_split import make_split
 from hypothesis import strategies as st
+from oodd_leaderboard.entry import GRANTS, read_grants
+from oodd_leaderboard.submit import Statement, submit
+from oodd_leaderboard.verify import verify
+from oodd_leaderboard.verify.rerun import ORDER, read_order
 
 from oodd_eval import evaluate, load_split
 from oodd_eval.data.bounded import STATE as STATE_BOUNDS
 from oodd_eval.data.bounded import Bounds, read_bytes, read_npz
 from oodd_eval.data.stored import StoredFile
 from oodd_eval.errors import FittedStateError, OoddError
-from oodd_eval.leaderboard.entry import GRANTS, read_grants
-from oodd_eval.leaderboard.submit import Statement, submit
-from oodd_eval.leaderboard.verify import verify
-from oodd_eval.leaderboard.verify.rerun import ORDER, read_order
 from oodd_eval.plugins.state import PackedState, labelled, pack, read_state, unlabelled, write_state
 
 

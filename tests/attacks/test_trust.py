@@ -7,11 +7,8 @@ import shutil
 import pytest
 from helpers_split import make_split
 from helpers_submission import Draft
-
-from oodd_eval import evaluate
-from oodd_eval.errors import ResultsError
-from oodd_eval.leaderboard import verify as verification
-from oodd_eval.leaderboard.entry import (
+from oodd_leaderboard import verify as verification
+from oodd_leaderboard.entry import (
     GRANTS,
     Grant,
     digest_of,
@@ -21,8 +18,11 @@ from oodd_eval.leaderboard.entry import (
     sections,
     write_grants,
 )
-from oodd_eval.leaderboard.submit import Statement, submit
-from oodd_eval.leaderboard.verify import verify
+from oodd_leaderboard.submit import Statement, submit
+from oodd_leaderboard.verify import verify
+
+from oodd_eval import evaluate
+from oodd_eval.errors import ResultsError
 
 
 @pytest.fixture(scope="module")

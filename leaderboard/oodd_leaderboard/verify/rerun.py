@@ -18,8 +18,6 @@ from typing import Annotated, ClassVar, Final, Literal, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from oodd_eval.leaderboard.entry import Means, read_json
-from oodd_eval.leaderboard.verify.files import Findings
 from oodd_eval.metrics.bootstrap import (
     calibration_samples,
     drawn_cell,
@@ -31,6 +29,8 @@ from oodd_eval.names import counted
 from oodd_eval.results.board import contribution, grouped
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
+from oodd_leaderboard.entry import Means, read_json
+from oodd_leaderboard.verify.files import Findings
 
 ORDER: Final = "rerun.json"
 SPLIT_DIRECTORY: Final = "split"  # directory of the split, in that of the re-run

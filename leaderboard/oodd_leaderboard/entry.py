@@ -9,7 +9,7 @@
 
 Records or curves of more than a megabyte are compressed: ``records.jsonl.xz``, ``curves.json.xz``.
 
-Entries are read here after they were verified (`oodd_eval.leaderboard.verify`): the shape of
+Entries are read here after they were verified (`oodd_leaderboard.verify`): the shape of
 ``entry.json`` and of each record is checked, their truth is not.
 
 Levels of trust are granted by maintainers in one file, ``trust.json``, which lies beside the

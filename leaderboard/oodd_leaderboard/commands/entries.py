@@ -14,15 +14,15 @@ from oodd_eval.cli import DIRECTORY, NAMES, Name, Names, Options, command, expre
 from oodd_eval.cli.console import make_console
 from oodd_eval.data.files import only_writer, temporary_directory
 from oodd_eval.errors import UsageError
-from oodd_eval.leaderboard import hub
-from oodd_eval.leaderboard import submit as submission
-from oodd_eval.leaderboard.build import STALE, differences, stale
-from oodd_eval.leaderboard.build import build as build_board
-from oodd_eval.leaderboard.entry import GRANTS, read_entries, read_entry, suite_sections
-from oodd_eval.leaderboard.verify import EntryVerdict, grant
-from oodd_eval.leaderboard.verify import verify as check
-from oodd_eval.leaderboard.verify import verify_changed as check_changed
 from oodd_eval.names import counted
+from oodd_leaderboard import hub
+from oodd_leaderboard import submit as submission
+from oodd_leaderboard.build import STALE, differences, stale
+from oodd_leaderboard.build import build as build_board
+from oodd_leaderboard.entry import GRANTS, read_entries, read_entry, suite_sections
+from oodd_leaderboard.verify import EntryVerdict, grant
+from oodd_leaderboard.verify import verify as check
+from oodd_leaderboard.verify import verify_changed as check_changed
 
 RESULTS: Final = "leaderboard/results"  # directory of the entries, from the root of a checkout
 

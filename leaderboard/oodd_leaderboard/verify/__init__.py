@@ -18,7 +18,10 @@ from oodd_eval.data.facts import SPLITS
 from oodd_eval.data.files import UNFINISHED, forms
 from oodd_eval.data.split import Split, load_split, published_digests
 from oodd_eval.errors import ResultsError, SplitError, UnknownNameError, UsageError
-from oodd_eval.leaderboard.entry import (
+from oodd_eval.results.board import defined_cells
+from oodd_eval.results.curve_file import check_curves
+from oodd_eval.results.directory import RECORDS
+from oodd_leaderboard.entry import (
     CURVES,
     ENTRY,
     GRANTS,
@@ -35,7 +38,7 @@ from oodd_eval.leaderboard.entry import (
     row_of,
     write_grants,
 )
-from oodd_eval.leaderboard.verify.files import (
+from oodd_leaderboard.verify.files import (
     Findings,
     check_digests,
     find_text,
@@ -44,8 +47,8 @@ from oodd_eval.leaderboard.verify.files import (
     read_files,
     short,
 )
-from oodd_eval.leaderboard.verify.formats import GRANTED_BY, complaint, read_info, read_records
-from oodd_eval.leaderboard.verify.recompute import (
+from oodd_leaderboard.verify.formats import GRANTED_BY, complaint, read_info, read_records
+from oodd_leaderboard.verify.recompute import (
     Records,
     check_against_split,
     check_record,
@@ -53,10 +56,7 @@ from oodd_eval.leaderboard.verify.recompute import (
     check_scores,
     check_together,
 )
-from oodd_eval.leaderboard.verify.rerun import Rerun
-from oodd_eval.results.board import defined_cells
-from oodd_eval.results.curve_file import check_curves
-from oodd_eval.results.directory import RECORDS
+from oodd_leaderboard.verify.rerun import Rerun
 
 ROOT_FILES: Final = frozenset({"README.md", ".gitkeep"})  # files that may lie beside the entries
 

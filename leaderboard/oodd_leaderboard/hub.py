@@ -13,11 +13,11 @@ from typing import Any, Final
 
 from oodd_eval.data.files import write_text
 from oodd_eval.errors import OutputError, UsageError
-from oodd_eval.leaderboard.entry import SubmittedEntry
 from oodd_eval.metrics.catalogue import metric_info
 from oodd_eval.results.board import Board, boards
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.standings import primary_settings
+from oodd_leaderboard.entry import SubmittedEntry
 
 _TASK: Final = {"type": "anomaly-detection", "name": "Detection of out-of-distribution dynamics"}
 

@@ -15,19 +15,6 @@ import click
 from oodd_eval.cli import DIRECTORY, NAMES, Name, Names, Options, command, say_notes, together
 from oodd_eval.cli.console import make_console
 from oodd_eval.errors import UsageError
-from oodd_eval.leaderboard.entry import ENTRY, read_entry
-from oodd_eval.leaderboard.published import (
-    MARK,
-    Placement,
-    PublishedBoard,
-    board_of,
-    neighbours,
-    neighbours_notes,
-    placement,
-    printed_name,
-    rankings,
-    read_published,
-)
 from oodd_eval.names import check_known, counted, select
 from oodd_eval.prose import print_prose
 from oodd_eval.results import tables
@@ -40,6 +27,19 @@ from oodd_eval.results.render.text import markdown_section, print_sections
 from oodd_eval.results.report import Section
 from oodd_eval.results.standings import Standing
 from oodd_eval.results.tables import Table
+from oodd_leaderboard.entry import ENTRY, read_entry
+from oodd_leaderboard.published import (
+    MARK,
+    Placement,
+    PublishedBoard,
+    board_of,
+    neighbours,
+    neighbours_notes,
+    placement,
+    printed_name,
+    rankings,
+    read_published,
+)
 
 NEARBY: Final = 3
 """Rows above and below those of a run that `place` prints."""

@@ -22,8 +22,6 @@ from oodd_eval.data.parts import CALIBRATION, TWINS
 from oodd_eval.data.split import Split
 from oodd_eval.data.stored import StoredFile
 from oodd_eval.errors import ContractError, OoddError, ResultsError
-from oodd_eval.leaderboard.entry import SCORES, EntryInfo
-from oodd_eval.leaderboard.verify.files import Findings, plain, short
 from oodd_eval.metrics.catalogue import METRICS, NAMES, metric_info
 from oodd_eval.metrics.ranking import Position
 from oodd_eval.plugins import contract
@@ -33,6 +31,8 @@ from oodd_eval.results.directory import EXPLAINED, RECORDS, ResultsDirectory
 from oodd_eval.results.draws import CodedDraws
 from oodd_eval.results.evaluate import counts_of, metric_of, rescore
 from oodd_eval.results.record import Metric, Record
+from oodd_leaderboard.entry import SCORES, EntryInfo
+from oodd_leaderboard.verify.files import Findings, plain, short
 
 Records = Mapping[str, Record]  # records by their line: ``records.jsonl:3 (<cell>)``
 TOLERANCE: Final = 1e-12  # relative and absolute: processors take sums in different orders

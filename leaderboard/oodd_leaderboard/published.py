@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from oodd_eval.errors import ResultsError, UsageError
-from oodd_eval.leaderboard.entry import LeaderboardSection, SuiteSection
 from oodd_eval.metrics.catalogue import FOUND_WITHIN, UNDEFINED, metric_info
 from oodd_eval.metrics.ranking import PairTest, Ranking
 from oodd_eval.names import counted
@@ -32,6 +31,7 @@ from oodd_eval.results.standings import (
     ranked,
 )
 from oodd_eval.results.tables import Mean, Table, texts
+from oodd_leaderboard.entry import LeaderboardSection, SuiteSection
 
 PUBLISHED: Final = "published.jsonl.xz"
 
@@ -128,7 +128,7 @@ def published_file() -> Path:
     `ResultsError`: there is none.
     """
     here = Path(__file__)
-    candidates = here.with_name(PUBLISHED), here.parents[2] / "leaderboard" / PUBLISHED
+    candidates = here.with_name(PUBLISHED), here.parents[1] / PUBLISHED
     for path in candidates:
         if path.is_file():
             return path

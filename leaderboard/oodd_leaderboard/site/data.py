@@ -20,12 +20,6 @@ from numpy.typing import NDArray
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, TABLE1, Quantity, paper_tables
 from oodd_eval.data.parts import EnvironmentData
 from oodd_eval.data.split import SHIPPED, Split
-from oodd_eval.leaderboard.entry import (
-    LeaderboardSection,
-    SubmittedEntry,
-    SuiteSection,
-    commands_of,
-)
 from oodd_eval.metrics.bootstrap import nan_mean
 from oodd_eval.metrics.catalogue import HEADLINE, METRICS, NAMES, RANKING, metric_info
 from oodd_eval.metrics.cusum import DRIFT, THRESHOLD
@@ -36,6 +30,7 @@ from oodd_eval.results.report import findings_of
 from oodd_eval.results.standings import Standing
 from oodd_eval.results.strengths import COSTS, DETECTION, Strengths, curve
 from oodd_eval.results.tables import missing_level
+from oodd_leaderboard.entry import LeaderboardSection, SubmittedEntry, SuiteSection, commands_of
 
 _COMPARED: Final = (
     "false_episodes",

@@ -14,16 +14,6 @@ from oodd_eval.data.facts import SPLITS, title_of
 from oodd_eval.data.files import PACKED, compress, decompress, write_bytes, write_text
 from oodd_eval.data.split import published_digests
 from oodd_eval.errors import ResultsError
-from oodd_eval.leaderboard import site
-from oodd_eval.leaderboard.entry import (
-    SUITES,
-    TABLES,
-    LeaderboardSection,
-    SubmittedEntry,
-    SuiteSection,
-    sections,
-)
-from oodd_eval.leaderboard.published import PUBLISHED, published_bytes
 from oodd_eval.names import counted, listed
 from oodd_eval.results import tables
 from oodd_eval.results.board import Board
@@ -34,6 +24,16 @@ from oodd_eval.results.report import Section, findings_of
 from oodd_eval.results.standings import RankedBoard, primary_settings, verdict_of
 from oodd_eval.results.tables import Table
 from oodd_eval.results.unpaired import UnpairedTables
+from oodd_leaderboard import site
+from oodd_leaderboard.entry import (
+    SUITES,
+    TABLES,
+    LeaderboardSection,
+    SubmittedEntry,
+    SuiteSection,
+    sections,
+)
+from oodd_leaderboard.published import PUBLISHED, published_bytes
 
 PAGE: Final = "README.md"
 SITE: Final = "site"

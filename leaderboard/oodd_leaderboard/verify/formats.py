@@ -16,8 +16,11 @@ from typing import Any, Final, NamedTuple
 from pydantic import TypeAdapter, ValidationError
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, NAME_PATTERN, PROTOCOL
-from oodd_eval.leaderboard.entry import ENTRY, SCHEMA, EntryInfo
-from oodd_eval.leaderboard.verify.files import (
+from oodd_eval.results import record as record_format
+from oodd_eval.results.directory import RECORDS
+from oodd_eval.results.record import Record
+from oodd_leaderboard.entry import ENTRY, SCHEMA, EntryInfo
+from oodd_leaderboard.verify.files import (
     MB,
     MOST_FILES,
     Findings,
@@ -26,9 +29,6 @@ from oodd_eval.leaderboard.verify.files import (
     plain,
     short,
 )
-from oodd_eval.results import record as record_format
-from oodd_eval.results.directory import RECORDS
-from oodd_eval.results.record import Record
 
 MOST_RECORDS: Final = 20_000
 MOST_LINE: Final = 4 * MB

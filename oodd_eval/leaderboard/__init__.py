@@ -1,1 +1,0 @@
-"""Leaderboard: entries as data, their verification, and the pages made from them."""
