@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from oodd_eval.plugins import hookimpl
     from oodd_eval.plugins.contract import Detector, DetectorSpec
     from oodd_eval.plugins.explanations import Explanation
-    from oodd_eval.testing import check_detector
 
 __all__ = [
     "AnomalySpec",
@@ -48,10 +47,10 @@ _NAMES = {
     "plugins": ("hookimpl",),
     "plugins.contract": ("Detector", "DetectorSpec"),
     "plugins.explanations": ("Explanation",),
-    "testing": ("check_detector",),
 }
 _HOMES = {name: f"{__name__}.{home}" for home, names in _NAMES.items() for name in names}
-_HOMES |= {"import_frames": "oodd_logs"}  # known by name alone: nothing here imports it
+# Known by name alone: nothing here imports these packages.
+_HOMES |= {"check_detector": "oodd_checks", "import_frames": "oodd_logs"}
 
 
 def __getattr__(name: str) -> Any:

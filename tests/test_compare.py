@@ -450,7 +450,7 @@ CHECK = (ROOT / ".ci/run").read_text()
 
 def test_the_document_names_every_verdict_and_every_option_of_the_plugin():
     assert all(re.search(rf"\b{verdict}\b", DOCUMENT) for verdict in MEANINGS)
-    source = (ROOT / "oodd_eval/pytest_plugin.py").read_text()
+    source = (ROOT / "checks/oodd_checks/pytest_plugin.py").read_text()
     options = set(re.findall(r'add\("(--oodd-[a-z-]+)"', source))
     assert options == set(re.findall(r"^\| `(--oodd-[a-z-]+)", DOCUMENT, re.MULTILINE))
 

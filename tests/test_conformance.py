@@ -2,9 +2,9 @@
 
 import pytest
 import torch
+from oodd_checks.testing import run_checks
 
 from oodd_eval.plugins.discovery import discover
-from oodd_eval.testing import run_checks
 
 pytestmark = pytest.mark.slow
 

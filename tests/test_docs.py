@@ -156,8 +156,8 @@ def test_links_out_of_docs_lead_to_pages_of_the_site(pages, site):
 
 
 def test_reference_has_every_public_name(site):
+
     import oodd_eval
-    import oodd_eval.testing
 
     text = "".join(p.read_text() for p in (site / "reference").glob("*.html"))
     names = {*oodd_eval.__all__} - {"__version__", "hookimpl"}

@@ -12,12 +12,12 @@ import pytest
 import yaml
 from helpers_docs import parse
 from helpers_plugins import install
+from oodd_checks import template
+from oodd_checks.template import LONGEST, Project, write_project
 
 from oodd_eval._version import repository
 from oodd_eval.cli.main import main
 from oodd_eval.errors import OutputError, UsageError
-from oodd_eval.plugins import template
-from oodd_eval.plugins.template import LONGEST, Project, write_project
 
 LONG = ("abcde-" * 9)[: LONGEST - 1] + "z"
 

@@ -37,8 +37,8 @@ def test_wheel_ships_data_policies_and_types(wheel):
         "oodd_recording/train/train.py",
         "oodd_eval/data/shipped/mini/manifest.json",
         "oodd_eval/data/shipped/mini/croissant.json",
-        "oodd_eval/plugins/template/templates/pyproject.toml.in",
-        "oodd_eval/plugins/template/templates/gitignore.in",
+        "checks/oodd_checks/template/templates/pyproject.toml.in",
+        "checks/oodd_checks/template/templates/gitignore.in",
         "oodd_eval/leaderboard/published.jsonl.xz",
         *(f"oodd_eval/data/recipes/{path.name}" for path in (ROOT / "recipes").glob("*.toml")),
     } <= names
@@ -87,7 +87,7 @@ def test_the_wheel_has_no_tests_and_the_licence(distributions):
     assert not parts & {"tests", "docs", "benchmarks", "__pycache__", ".work", "conftest.py"}
     # Checks of detectors are part of the product, and they alone.
     modules = {str(Path(name).parent) for name in names if Path(name).name.startswith("test_")}
-    assert modules == {"oodd_eval/plugins/conformance"}
+    assert modules == {"checks/oodd_checks/conformance"}
 
 
 def test_metadata_say_what_the_project_says(distributions):

@@ -6,9 +6,9 @@ from types import SimpleNamespace
 
 import pytest
 from helpers_plugins import install
+from oodd_checks.pytest_cells import Cells, Regression
 
 from oodd_eval import evaluate
-from oodd_eval.pytest_cells import Cells, Regression
 from oodd_eval.results.compare import read_record_set, write_reference
 from oodd_eval.results.record import Metric
 
@@ -64,7 +64,7 @@ def test_off_unless_asked_and_nothing_of_the_harness_is_imported(run, pytester):
         "import sys\n"
         "def test_imports():\n"
         "    loaded = {m for m in sys.modules if m.startswith('oodd_eval')}\n"
-        "    assert loaded == {'oodd_eval', 'oodd_eval._version', 'oodd_eval.pytest_plugin'}\n"
+        "    assert loaded == {'oodd_eval', 'oodd_eval._version', 'oodd_checks.pytest_plugin'}\n"
         "    assert not {'numpy', 'h5py', 'pluggy.x', 'rich.table'} & set(sys.modules)\n"
     )
     # hypothesis' plug-in and pytest-benchmark's may import what they like.

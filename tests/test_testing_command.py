@@ -5,9 +5,9 @@ import sys
 
 import pytest
 from helpers_plugins import install
+from oodd_checks.testing import CHECKS
 
 from oodd_eval.cli import main as cli
-from oodd_eval.testing import CHECKS
 
 NAMES = list(CHECKS)
 
@@ -198,9 +198,9 @@ def test_other_ways_to_misuse_the_process_are_named(check, name, message):
 
 
 def test_without_pytest_the_extra_is_named(check, monkeypatch):
-    for name in [n for n in sys.modules if n.startswith("oodd_eval.plugins.conformance")]:
+    for name in [n for n in sys.modules if n.startswith("oodd_checks.conformance")]:
         monkeypatch.delitem(sys.modules, name)
-    monkeypatch.delitem(sys.modules, "oodd_eval.testing")
+    monkeypatch.delitem(sys.modules, "oodd_checks.testing")
     monkeypatch.setitem(sys.modules, "pytest", None)
     code, _, err = check("fine")
     assert code == 4

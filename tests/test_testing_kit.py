@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from broken_detectors import BROKEN, ENDS, GOOD, STARTED, Good
+from oodd_checks.conformance import CheckReport, Result
+from oodd_checks.conformance.session import CHECKS, run_tests
+from oodd_checks.conformance.trial import Trial
+from oodd_checks.testing import NonConformingError, run_checks
 
 from oodd_eval import check_detector
-from oodd_eval.plugins.conformance import CheckReport, Result
-from oodd_eval.plugins.conformance.session import CHECKS, run_tests
-from oodd_eval.plugins.conformance.trial import Trial
-from oodd_eval.testing import NonConformingError, run_checks
 
 pytest_plugins = ["pytester"]
 
@@ -219,7 +219,7 @@ def test_a_module_of_tests_has_every_check(pytester):
     pytester.makepyfile("""
         import pytest
         from oodd_eval import DetectorSpec
-        from oodd_eval.testing import *
+        from oodd_checks.testing import *
         from oodd_trivial import Clock
 
         @pytest.fixture(scope="module")
@@ -235,7 +235,7 @@ def test_a_module_of_tests_has_every_check(pytester):
 
 def test_the_plug_in_checks_detectors_by_name(pytester):
     done = pytester.runpytest_subprocess(
-        "--pyargs", "oodd_eval.plugins.conformance", "--oodd-detector", "clock,persistence",
+        "--pyargs", "oodd_checks.conformance", "--oodd-detector", "clock,persistence",
         "-pno:cacheprovider", "-n0",
     )  # fmt: skip
     outcomes = done.parseoutcomes()

@@ -87,8 +87,8 @@ COMMANDS: Final[Mapping[str, Commands]] = {
         "leaderboard": ("show, submit and verify entries of the board", LEADERBOARD),
     },
     "Add your own": {
-        "new": ("write a ready plug-in project", "oodd_eval.cli.new:new"),
-        "check": ("check that a detector honours the contract", "oodd_eval.cli.check:check"),
+        "new": ("write a ready plug-in project", "oodd_checks.commands.new:new"),
+        "check": ("check that a detector honours the contract", "oodd_checks.commands.check:check"),
         "data": ("import, record, verify, fetch and export splits", DATA),
         "policies": ("train and evaluate nominal policies", POLICIES),
         "completion": ("print a script for a shell's completion", "oodd_eval.cli.main:completion"),

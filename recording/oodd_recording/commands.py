@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Final
 
 import click
+from oodd_checks.commands.check import STYLES
+from oodd_checks.conformance import CheckReport, Result
 
 from oodd_eval.cli import (
     COUNT,
@@ -24,7 +26,6 @@ from oodd_eval.cli import (
     refuse,
     say,
 )
-from oodd_eval.cli.check import STYLES
 from oodd_eval.cli.console import make_console
 from oodd_eval.cli.plugins import register_custom
 from oodd_eval.data.condition import Condition
@@ -34,7 +35,6 @@ from oodd_eval.data.registry import AnomalySpec, EnvironmentSpec, inner_of
 from oodd_eval.data.split import data_home, load_split
 from oodd_eval.errors import UsageError
 from oodd_eval.names import Predicate, assignment, counted, select
-from oodd_eval.plugins.conformance import CheckReport, Result
 from oodd_recording.build import build_split
 from oodd_recording.calibrate import calibrate as find_strengths
 from oodd_recording.checks import custom_checks

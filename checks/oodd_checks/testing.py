@@ -2,7 +2,7 @@
 
 ::
 
-    from oodd_eval.testing import *
+    from oodd_checks.testing import *
 
     @pytest.fixture(scope="module")
     def detector():
@@ -15,18 +15,18 @@ own, so that a crash is reported too: ``oodd-eval check mine``.
 from collections.abc import Mapping
 from typing import Any
 
+from oodd_checks.conformance import CheckReport, Result
 from oodd_eval.errors import ContractError, MissingExtraError
 from oodd_eval.names import check_known
-from oodd_eval.plugins.conformance import CheckReport, Result
 
 try:
-    from oodd_eval.plugins.conformance.trial import Factory, Trial, shared_trial, trial
+    from oodd_checks.conformance.trial import Factory, Trial, shared_trial, trial
 except ModuleNotFoundError as missing:
     raise MissingExtraError(
         f"checks of detectors need pytest ({missing}): pip install 'oodd-eval[check]'"
     ) from missing
 
-from oodd_eval.plugins.conformance.session import CHECKS, run_tests, supervise
+from oodd_checks.conformance.session import CHECKS, run_tests, supervise
 
 globals().update({check.__name__: check for check in CHECKS.values()})
 

@@ -4,6 +4,7 @@ from typing import Final
 
 import click
 
+from oodd_checks.conformance import CheckReport
 from oodd_eval.cli import (
     Converted,
     Name,
@@ -19,7 +20,6 @@ from oodd_eval.cli.console import make_console
 from oodd_eval.cli.plugins import discovered
 from oodd_eval.errors import UnknownNameError
 from oodd_eval.names import assignment, check_known, expression
-from oodd_eval.plugins.conformance import CheckReport
 from oodd_eval.plugins.isolation.child import Limits
 from oodd_eval.plugins.parameters import parameters_by_detector, resolve_parameters
 
@@ -53,7 +53,7 @@ def check(options: Options) -> int:
 
     The exit code is 1 when a check failed, and 5 when none ran.
     """
-    from oodd_eval.testing import CHECKS, supervise
+    from oodd_checks.testing import CHECKS, supervise
 
     limits = Limits(options.timeout, options.memory)
     expecting = dict(options.expect)

@@ -2,7 +2,7 @@
 
 A process of its own is given up when its detector crashes or hangs: then the check that it was at
 has failed, and a new process goes on with the next one. Such a process runs this module, too, as
-``python -m oodd_eval.plugins.conformance.session CHANNEL_FD LIFELINE_FD``.
+``python -m oodd_checks.conformance.session CHANNEL_FD LIFELINE_FD``.
 """
 
 import os
@@ -20,9 +20,9 @@ from unittest.mock import patch
 
 import pytest
 
+from oodd_checks.conformance import Result, test_detector
+from oodd_checks.conformance.trial import Trial
 from oodd_eval.errors import ContractError, UsageError
-from oodd_eval.plugins.conformance import Result, test_detector
-from oodd_eval.plugins.conformance.trial import Trial
 from oodd_eval.plugins.discovery import Offer, offer_of, printable
 from oodd_eval.plugins.isolation import ChannelClosedError, ChannelGarbledError
 from oodd_eval.plugins.isolation.child import Child, GivenUpError, Limits

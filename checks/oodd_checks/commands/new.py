@@ -5,10 +5,10 @@ from pathlib import Path
 
 import click
 
+from oodd_checks.template import Project, write_project
 from oodd_eval.cli import DIRECTORY, Options, command
 from oodd_eval.errors import UsageError
 from oodd_eval.plugins.discovery import discover
-from oodd_eval.plugins.template import Project, write_project
 
 
 @command("new my-detector", plugins=True)

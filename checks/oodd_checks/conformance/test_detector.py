@@ -16,11 +16,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from oodd_eval.data.trajectory import Trajectory
-from oodd_eval.metrics.auc import auc
-from oodd_eval.names import counted
-from oodd_eval.plugins.conformance.side_effects import DAEMON, outside, seeded_generators
-from oodd_eval.plugins.conformance.trial import (
+from oodd_checks.conformance.side_effects import DAEMON, outside, seeded_generators
+from oodd_checks.conformance.trial import (
     SENSORS,
     RaisedError,
     Trial,
@@ -33,6 +30,9 @@ from oodd_eval.plugins.conformance.trial import (
     shared_trial,
     trial,
 )
+from oodd_eval.data.trajectory import Trajectory
+from oodd_eval.metrics.auc import auc
+from oodd_eval.names import counted
 from oodd_eval.plugins.contract import (
     TOLERANCE,
     Detector,

@@ -1,6 +1,6 @@
 """Tests that a detector honours the contract, in pytest, and what they came to.
 
-The module `test_detector` holds the tests; `oodd_eval.testing` is their public face.
+The module `test_detector` holds the tests; `oodd_checks.testing` is their public face.
 """
 
 import textwrap

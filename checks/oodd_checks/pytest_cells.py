@@ -10,12 +10,12 @@ from typing import Any
 
 import pytest
 
+from oodd_checks.conformance.trial import Trial
 from oodd_eval.data.facts import PROTOCOL
 from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import OoddError, UnknownNameError, UsageError
 from oodd_eval.metrics.catalogue import NAMES
 from oodd_eval.names import counted, select
-from oodd_eval.plugins.conformance.trial import Trial
 from oodd_eval.plugins.discovery import Plugins, discover
 from oodd_eval.results.board import Conditions
 from oodd_eval.results.compare import (
@@ -48,7 +48,7 @@ class Conformance:
 
     def pytest_generate_tests(self, metafunc: pytest.Metafunc) -> None:
         """Give the shipped tests every detector."""
-        if metafunc.module.__name__.startswith("oodd_eval.plugins.conformance."):
+        if metafunc.module.__name__.startswith("oodd_checks.conformance."):
             trials = self._trials
             metafunc.parametrize("detector", trials.values(), ids=[*trials], scope="module")
 

@@ -4,7 +4,7 @@
 
     pytest --oodd-detector mine --oodd-reference reference.jsonl
 
-adds one test per cell; ``--pyargs oodd_eval.plugins.conformance`` in place of a reference runs the
+adds one test per cell; ``--pyargs oodd_checks.conformance`` in place of a reference runs the
 conformance checks of the detector. Without ``--oodd-detector`` nothing happens: pytest loads this
 module in every environment in which oodd-eval is installed, so the harness is imported only when
 asked for.
@@ -41,9 +41,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     """Register the check if a detector is named."""
     if config.getoption("oodd_detector"):
-        from oodd_eval.pytest_cells import Cells, Conformance  # noqa: PLC0415  see above
+        from oodd_checks.pytest_cells import Cells, Conformance  # noqa: PLC0415  see above
 
-        conformance = any("oodd_eval.plugins.conformance" in name for name in config.args)
+        conformance = any("oodd_checks.conformance" in name for name in config.args)
         config.pluginmanager.register(Conformance(config) if conformance else Cells(config))
         return
     for name in _OTHERS:

@@ -18,10 +18,10 @@ from typing import Any, Final
 import numpy as np
 import pytest
 
+from oodd_checks.conformance.side_effects import Effects, Events, auditing, watch
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import ContractError
 from oodd_eval.metrics.auc import Floats
-from oodd_eval.plugins.conformance.side_effects import Effects, Events, auditing, watch
 from oodd_eval.plugins.contract import (
     ROLLOUT_TOLERANCE,
     TOLERANCE,

@@ -1,0 +1,1 @@
+"""Commands for authors of detectors: `new` and `check`."""
