@@ -19,7 +19,7 @@ from oodd_eval.data.facts import LICENCE, SPLITS
 from oodd_eval.data.info import describe
 from oodd_eval.data.split import SHIPPED
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 def exported(split, directory, *further):

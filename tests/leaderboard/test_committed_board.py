@@ -16,7 +16,7 @@ from oodd_leaderboard.verify import verify
 
 from oodd_eval.data.files import read_text
 
-BOARD = Path(__file__).parents[1] / "leaderboard"
+BOARD = Path(__file__).parents[2] / "leaderboard"
 
 NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e[+-]?\d+)?(?![\w.])")
 

@@ -14,7 +14,7 @@ from PIL import Image
 pytestmark = pytest.mark.slow
 
 pytest.importorskip("gymnasium", reason="needs the extra gym")
-EXAMPLE = Path(__file__).parents[1] / "examples" / "live_alarm.py"
+EXAMPLE = Path(__file__).parents[2] / "examples" / "live_alarm.py"
 
 
 @pytest.fixture(scope="module")

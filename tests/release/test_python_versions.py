@@ -236,7 +236,9 @@ USES = {
     "check": ["oodd_eval check persistence"],
     "plots": [f"{RUN} persistence", "draw"],
     "docs": [f"mkdocs build --quiet --strict --config-file {ROOT}/mkdocs.yml --site-dir site"],
-    "test": [f"pytest -n 0 -p no:cacheprovider --rootdir {ROOT} {ROOT}/tests/test_worlds.py"],
+    "test": [
+        f"pytest -n 0 -p no:cacheprovider --rootdir {ROOT} {ROOT}/tests/recording/test_worlds.py"
+    ],
     "dev": [
         f"mypy --cache-dir mypy --follow-imports skip {ROOT}/oodd_eval/errors.py",
         "build --version",

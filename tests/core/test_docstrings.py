@@ -19,7 +19,7 @@ import yaml
 import oodd_eval
 from oodd_eval import errors
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 SEARCH = [
     ROOT,
     *(ROOT / name for name in ("checks", "leaderboard", "live", "logs", "recording")),

@@ -10,7 +10,7 @@ import pytest
 
 from oodd_eval.metrics.accumulation import accumulated
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 SPEC = importlib.util.spec_from_file_location("run_lengths", ROOT / "benchmarks/run_lengths.py")
 run_lengths = importlib.util.module_from_spec(SPEC)
 SPEC.loader.exec_module(run_lengths)

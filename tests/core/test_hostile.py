@@ -317,7 +317,7 @@ def test_plugins_that_kill_hang_or_fail_at_import_do_not_touch_runs_of_others(ho
 
 
 def test_the_page_about_isolation_tells_every_state():
-    page = (Path(__file__).parents[1] / "docs" / "isolation.md").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "isolation.md").read_text()
     told = re.findall(r"^\| `(\w+)` \| ", page, re.MULTILINE)
     assert ("ok", *told) == STATUSES
 

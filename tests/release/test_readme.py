@@ -12,7 +12,7 @@ from oodd_leaderboard.entry import read_entries
 
 from oodd_eval.results.directory import ResultsDirectory
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md")),
              *sorted((ROOT / "detectors").rglob("*.md"))]  # fmt: skip

@@ -44,7 +44,7 @@ KINDS = [
     ("tank", "pump-wear", 0.05),
 ]
 SEED = 982_000_000
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(autouse=True)

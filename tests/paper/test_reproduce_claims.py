@@ -265,7 +265,7 @@ environments = ["ant"]
 
 
 def test_the_claim_that_the_docs_show_can_be_added(tmp_path):
-    page = Path(__file__).parents[1] / "docs" / "reproduce.md"
+    page = Path(__file__).parents[2] / "docs" / "reproduce.md"
     shown = page.read_text().partition("```toml\n")[2].partition("```")[0]
     (tmp_path / "claims.toml").write_text(shown)
     (claim,) = read_tables(tmp_path / "claims.toml", "claim", Claim.of)

@@ -23,7 +23,7 @@ from oodd_eval.cli.main import main
 from oodd_eval.errors import MissingExtraError, UsageError
 from oodd_eval.metrics.binomial import clopper_pearson
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 SENSORS = ["speed", "torque", "current"]
 
 

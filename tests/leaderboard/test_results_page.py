@@ -12,7 +12,7 @@ from oodd_eval.cli.main import main
 from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_eval.results.identity import Setting
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 SPEC = importlib.util.spec_from_file_location("tables", ROOT / "docs" / "figures" / "tables.py")
 tables = importlib.util.module_from_spec(SPEC)
 SPEC.loader.exec_module(tables)

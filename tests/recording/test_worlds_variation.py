@@ -33,7 +33,7 @@ def script(monkeypatch):
     register([*oodd_environments(), *oodd_anomalies()])
     for name in WORLDS:
         monkeypatch.setattr(f"oodd_worlds.{name}.WORLD", read_world(name))
-    monkeypatch.syspath_prepend(Path(__file__).parent.parent / "benchmarks")
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "benchmarks")
     yield importlib.import_module("worlds_variation")
     del sys.modules["worlds_variation"]
     forget_own()

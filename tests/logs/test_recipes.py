@@ -15,7 +15,7 @@ from oodd_logs.shipped_recipes import shipped_recipes
 from oodd_eval import evaluate, load_split
 from oodd_eval.cli.main import main
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 SPEC = importlib.util.spec_from_file_location("public_logs", ROOT / "benchmarks/public_logs.py")
 public_logs = importlib.util.module_from_spec(SPEC)
 SPEC.loader.exec_module(public_logs)

@@ -7,7 +7,7 @@ import pytest
 
 from oodd_eval.cli.main import main
 
-BOARD = Path(__file__).parents[1] / "leaderboard"
+BOARD = Path(__file__).parents[2] / "leaderboard"
 RESULTS = BOARD / "results"
 COMMITTED = sorted(header.parent for header in BOARD.rglob("reproduction.json"))
 BESIDE = {"mini-paper": "mini", "standard": "mini", "reduced-paper": "standard"}

@@ -186,7 +186,7 @@ def test_a_mean_over_cells_is_that_of_their_resamples():
 
 # -- coverage -------------------------------------------------------------------------------------
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 def coverage_script():

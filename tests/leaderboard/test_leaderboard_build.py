@@ -308,8 +308,8 @@ def test_expected_cells_of_published_splits_are_those_of_their_definition(name):
     digest = published_digests()[name]
     cells = expected_cells([dataclasses.replace(make_record(digest=digest), split=name)])
     assert {e for e, _ in cells} == set(ENVIRONMENTS)
-    suites = Path(__file__).parents[1] / "leaderboard" / "suites"
-    files = suites / name, Path(__file__).parents[1] / "leaderboard" / "results" / "paper-mini"
+    suites = Path(__file__).parents[2] / "leaderboard" / "suites"
+    files = suites / name, Path(__file__).parents[2] / "leaderboard" / "results" / "paper-mini"
     for directory in filter(Path.is_dir, files):
         records = ResultsDirectory(directory).records()
         if {r.split_digest for r in records} == {digest}:
@@ -580,7 +580,7 @@ def test_csv_of_cells_has_a_line_per_cell_with_stored_metrics():
 
 
 def test_every_column_of_the_table_of_cells_is_described():
-    page = (Path(__file__).parents[1] / "docs" / "board-data.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "board-data.md").read_text(encoding="utf-8")
     listed = [name for row in re.findall(r"^\| (`.*?) \|", page, re.MULTILINE)
               for name in re.findall(r"`(\w+)`", row)]  # fmt: skip
     columns = list(lines_of(decompress(cells(sections(entries()))).decode())[0])
@@ -591,7 +591,7 @@ def test_every_column_of_the_table_of_cells_is_described():
 
 def test_the_pages_program_reads_the_table(tmp_path, monkeypatch, capsys):
     pytest.importorskip("pandas")
-    page = (Path(__file__).parents[1] / "docs" / "board-data.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "board-data.md").read_text(encoding="utf-8")
     (program,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     built(tmp_path, entries(), "leaderboard")
     monkeypatch.chdir(tmp_path)

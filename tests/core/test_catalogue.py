@@ -123,7 +123,7 @@ def test_numbers_are_printed_by_their_unit(name, value, text):
 
 
 def test_the_documented_metrics_are_those_of_the_catalogue():
-    text = (Path(__file__).parents[1] / "docs/metrics.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[2] / "docs/metrics.md").read_text(encoding="utf-8")
     documented = re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE)
     levels = {name.partition("_at_")[0] for name in NAMES if metric_info(name).level}
     assert len(documented) > 12

@@ -37,7 +37,7 @@ from oodd_eval.results.render.text import markdown_section
 from oodd_eval.results.report import change, comparison_section
 
 NAN = math.nan
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 AUC = parse_tolerance("auc:-0.01")
 DELAY = parse_tolerance("delay:+10%")
 

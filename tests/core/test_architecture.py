@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 PACKAGES = sorted(
     path.parent
     for path in (*ROOT.glob("*/__init__.py"), *ROOT.glob("*/oodd_*/__init__.py"),

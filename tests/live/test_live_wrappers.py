@@ -22,7 +22,7 @@ from gymnasium.vector import AutoresetMode  # noqa: E402
 from oodd_live import VectorWatchdogWrapper, WatchdogWrapper  # noqa: E402
 from oodd_live.wrappers import as_row  # noqa: E402
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")

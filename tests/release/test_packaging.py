@@ -18,7 +18,7 @@ from trove_classifiers import classifiers, deprecated_classifiers
 
 pytestmark = pytest.mark.packaging
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 def test_wheel_ships_only_leaf_named_packages(wheel):

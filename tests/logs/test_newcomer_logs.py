@@ -18,7 +18,7 @@ from helpers_docs import commands, python_blocks
 
 pytestmark = pytest.mark.docs
 
-PAGE = Path(__file__).parents[1] / "docs" / "how-to" / "own-data.md"
+PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "own-data.md"
 TEXT = PAGE.read_text(encoding="utf-8")
 SECTION = re.search(r"^## From a folder.*?(?=^## )", TEXT, re.MULTILINE | re.DOTALL)[0]
 (SCRIPT,) = python_blocks(SECTION)
