@@ -9,7 +9,7 @@ import time
 import zipfile
 
 import pytest
-from helpers_split import make_split
+from helpers_split import edit_manifest, make_split
 
 from oodd_eval.cli.main import main
 from oodd_eval.data import fetch as fetching
@@ -241,10 +241,8 @@ def test_an_archive_of_a_split_among_many_files_is_refused(small, home, tmp_path
 
 @pytest.mark.parametrize("name", ["\x1b[2J", "a/b", "..", ".fetch", "con\u202etrol", ""])
 def test_a_name_that_is_none_is_refused(small, home, tmp_path, name):
-    from test_transfer import edit
-
     copy = shutil.copytree(small, tmp_path / "copy")
-    edit(copy, lambda manifest: manifest.update(name=name))
+    edit_manifest(copy, lambda manifest: manifest.update(name=name))
     with pytest.raises(SplitError, match=r"which is no name|String should match"):
         fetch(str(copy))
     assert not list(home.glob("*/manifest.json"))

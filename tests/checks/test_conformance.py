@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from helpers_detectors import SMALL
 from oodd_checks.testing import run_checks
 
 from oodd_eval.plugins.discovery import discover
@@ -19,32 +20,6 @@ ADAPTERS = [
     "forecast:sklearn.linear_model.Ridge",
 ]
 """Some of those that are made of any class of a library."""
-
-NETWORK = {"updates": 3, "members": 2}
-ENSEMBLE = {"updates": 20, "width": 16}
-FEW_UNITS = {"updates": 20, "units": 16}
-QUANTILES = {**NETWORK, "samples": 2, "levels": 2}
-SMALL = {
-    "rf": {"members": 2, "trees": 2},
-    "rf-ewma": {"members": 2, "trees": 2},
-    "riqn": QUANTILES,
-    "riqn-ms": QUANTILES,
-    "riqn-r": QUANTILES,
-    "n-riqn": QUANTILES,
-    "npn": NETWORK,
-    "pe": ENSEMBLE,
-    "pe-a": ENSEMBLE,
-    "pe-step": ENSEMBLE,
-    "pe-step-a": ENSEMBLE,
-    "rnd": ENSEMBLE,
-    "rpt-a": FEW_UNITS,
-    "logpzo": FEW_UNITS,
-    "logpzo-a": FEW_UNITS,
-    "wm-kl-a": FEW_UNITS,
-    "paano": {**ENSEMBLE, "window": 8, "batch": 16},
-    "sklearn:IsolationForest": {"n_estimators": 10},
-}
-"""What makes a slow detector quick enough to be tried."""
 
 EXPECTED_FAILURES = {
     name: {"gross-anomaly": "a row for comparison: it knows nothing of the sensors"}

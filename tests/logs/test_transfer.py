@@ -20,14 +20,13 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from helpers_split import make_split
+from helpers_split import edit_manifest, make_split
 from oodd_logs.readers import minari
 
 from oodd_eval import load_split
 from oodd_eval.cli.main import main
 from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_eval.data.fetch import fetch
-from oodd_eval.data.layout import split_digest
 from oodd_eval.data.parts import parts_of
 from oodd_eval.data.split import SHIPPED, split_directories
 from oodd_eval.errors import DigestError, OutputError, SplitError, SplitNotFoundError, UsageError
@@ -178,17 +177,8 @@ def test_where_nothing_can_be_fetched_the_address_is_named(home, web, address, e
 # What is refused; after each of these nothing is installed.
 
 
-def edit(directory, change):
-    """Change a manifest and make its digests fit, as somebody would who wants to deceive."""
-    file = directory / "manifest.json"
-    manifest = json.loads(file.read_text())
-    change(manifest)
-    manifest["digest"] = split_digest(manifest["environments"], manifest["definition"])
-    file.write_text(json.dumps(manifest))
-
-
 def test_a_manifest_that_leads_out_of_the_split_is_refused(copy, home):
-    edit(copy, lambda m: m["environments"]["hopper"].update(file="../../hopper.h5"))
+    edit_manifest(copy, lambda m: m["environments"]["hopper"].update(file="../../hopper.h5"))
     with pytest.raises(SplitError, match=r"expected 'hopper.h5'"):
         fetch(str(copy))
     assert not list(home.glob("*/manifest.json"))

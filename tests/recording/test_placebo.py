@@ -3,15 +3,17 @@
 import numpy as np
 import pytest
 import torch
+from helpers_detectors import SMALL
 from helpers_split import make_group, make_split
-from test_conformance import PLUGINS, SMALL
 
 from oodd_eval import evaluate
 from oodd_eval.data.facts import ENVIRONMENTS, SplitDefinition
 from oodd_eval.data.layout import write_environment, write_manifest
 from oodd_eval.data.parts import TWINS
+from oodd_eval.plugins.discovery import discover
 
 ENVIRONMENT = "hopper"
+PLUGINS = discover()
 
 
 @pytest.fixture(autouse=True, scope="module")
