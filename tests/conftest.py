@@ -18,6 +18,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from helpers_split import make_split
 
+TESTS = Path(__file__).parent
+
 # Until the tests are collected, nothing is garbage. `pytest_collection_finish` ends this.
 gc.disable()
 
@@ -33,40 +35,29 @@ with warnings.catch_warnings(), contextlib.suppress(ImportError):
 
 
 def pytest_addoption(parser):
-    """Add the option that turns seconds of random attacks into hours."""
+    """Add the option that turns seconds of random attacks into hours, and that of samples."""
     parser.addoption("--long", action="store_true", help="random attacks: many thousands of them")
+    parser.addoption(
+        "--tenth", action="append", default=[], metavar="FOLDER",
+        help="run every tenth test of this folder, too",
+    )  # fmt: skip
 
 
-LONGEST = (
-    ("test_docs", "test_walk", "test_packaging", "test_python_versions", "test_examples",
-     "test_site_browser"),
-    ("test_committed_board", "test_docs_commands"),
-)  # fmt: skip
-"""Modules that take longest, as two processes share them out to begin with."""
+def pytest_configure(config):
+    """Collect the folders of which a sample runs, too."""
+    if sampled := config.getoption("--tenth"):
+        if config.args_source is pytest.Config.ArgsSource.TESTPATHS:
+            config.args = []
+        config.args += {*(str(TESTS / name) for name in sampled)} - {*config.args}
 
 
-@pytest.hookimpl(trylast=True)  # when the tests of other marks are out
-def pytest_collection_modifyitems(items):
-    """Let every process begin with long tests, so that those left at the end are short.
-
-    pytest-xdist gives each process a stretch of the tests. A process that has finished its own
-    takes over the last ones of another process.
-    """
-    place = {name: i for i, names in enumerate(LONGEST) for name in names}
-    heads = [[] for _ in LONGEST]
-    rest = []
-    for item in items:
-        i = place.get(item.path.stem)
-        (rest if i is None else heads[i]).append(item)
-    for i, names in enumerate(LONGEST):
-        heads[i].sort(key=lambda item, names=names: names.index(item.path.stem))
-    found, total = [], len(items)
-    for i, head in enumerate(heads):
-        # As pytest-xdist shares them out.
-        size = (total - len(found)) // (len(heads) - i) - len(head)
-        found += head + rest[: max(0, size)]
-        del rest[: max(0, size)]
-    items[:] = found + rest
+def pytest_collection_modifyitems(config, items):
+    """Leave out nine of ten tests of the folders that --tenth names."""
+    sampled = {TESTS / name for name in config.getoption("--tenth")}
+    of_samples = [item for item in items if sampled & {*item.path.parents}]
+    left_out = {*of_samples} - {*of_samples[::10]}
+    config.hook.pytest_deselected(items=[item for item in items if item in left_out])
+    items[:] = [item for item in items if item not in left_out]
 
 
 def pytest_collection_finish():
