@@ -15,8 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.metrics.accumulation import AlarmKind
-from oodd_eval.metrics.alarms import GuaranteedAlarm, guaranteed_contributions
+from oodd_eval.metrics.alarms import AlarmKind, GuaranteedAlarm, guaranteed_contributions
 from oodd_eval.metrics.auc import Contribution
 from oodd_eval.metrics.bootstrap import DrawnCells, drawn_cell, mean_interval
 from oodd_eval.metrics.catalogue import IntervalKind, metric_info

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from oodd_eval.data.baseline import Baseline, undefined
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import ContractError, UsageError
-from oodd_eval.metrics.accumulation import STATISTICS, AlarmKind
+from oodd_eval.metrics.alarms import STATISTICS, AlarmKind
 from oodd_eval.names import read, whole_number
 from oodd_eval.plugins.contract import (
     AnyDetector,

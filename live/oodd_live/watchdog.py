@@ -20,8 +20,15 @@ from oodd_eval.errors import (
     TrajectoryError,
     UsageError,
 )
-from oodd_eval.metrics.accumulation import AlarmKind, basis_from, basis_of
-from oodd_eval.metrics.alarms import Calibration, GuaranteedAlarm, Monitor, least_episodes, too_few
+from oodd_eval.metrics.alarms import (
+    AlarmKind,
+    Calibration,
+    GuaranteedAlarm,
+    Monitor,
+    least_episodes,
+    too_few,
+)
+from oodd_eval.metrics.cusum import Standardization
 from oodd_eval.names import check_known, counted
 from oodd_eval.plugins.contract import AnyDetector, StorableDetector, copied
 from oodd_eval.plugins.state import pack, read_state, write_state
@@ -155,8 +162,8 @@ class Watchdog:
         hold_off
             Rows after the end of an alarm in which no new one is raised.
         statistic
-            ``"cusum"``, ``"score"``, ``"ewma"``, ``"shiryaev-roberts"`` or ``"e-detector"``: see
-            `GuaranteedAlarm`. Default what a named detector declares, else the CUSUM.
+            ``"cusum"`` or ``"score"``: see `GuaranteedAlarm`. Default what a named detector
+            declares, else the CUSUM.
         seed, horizon, parameters
             For the factory of a named detector, or for the class or function.
 
@@ -216,7 +223,8 @@ class Watchdog:
             if any(faults):
                 notes.append(_faults_note(faults, nominal.sensors))
             return cls(handle, fitted, rule, limits, nominal, settings, None, notes)
-        unbounded = GuaranteedAlarm(basis_of(handle.alarm, scores), math.inf, handle.alarm)
+        standardization = Standardization.fit(scores) if handle.alarm == "cusum" else None
+        unbounded = GuaranteedAlarm(standardization, math.inf)
         # One after the other: what a sum has reached at the end of one goes on in the next.
         joined = unbounded.statistic(np.concatenate(scores))
         ends = np.cumsum([len(s) for s in scores])
@@ -583,7 +591,7 @@ class Watchdog:
         scale, known, length = (
             values[name] for name in ("standardization", "calibration", "run_length")
         )
-        standardization = scale and basis_from(handle.alarm, [_finite(x) for x in scale])
+        standardization = scale and Standardization(*map(_finite, scale))
         calibration = known and Calibration(
             handle.alarm,
             standardization,
@@ -599,7 +607,7 @@ class Watchdog:
             latch=bool(chosen["latch"]),
             hold_off=int(chosen["hold_off"]),
         )
-        rule = GuaranteedAlarm(standardization, _finite(values["threshold"]), handle.alarm)
+        rule = GuaranteedAlarm(standardization, _finite(values["threshold"]))
         run_length = length and RunLength(*map(_finite, length))
         arrays = {
             name.removeprefix(DETECTOR): array

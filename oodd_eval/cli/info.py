@@ -24,7 +24,6 @@ from oodd_eval.data.layout import log_facts
 from oodd_eval.data.registry import AnomalySpec, Spec
 from oodd_eval.data.split import imported_environments, split_directories
 from oodd_eval.errors import UnknownNameError, UsageError, near
-from oodd_eval.metrics.accumulation import NOUNS
 from oodd_eval.metrics.catalogue import NAMES, MetricInfo, metric_info
 from oodd_eval.names import counted
 from oodd_eval.plugins.contract import Training
@@ -193,8 +192,7 @@ def _detector(offer: Offer) -> Lines:
         yield "unavailable", why
     yield "source", spec.reference or "not given"
     yield "looks at", spec.inputs.replace("+", " and ")
-    sums = f"{NOUNS[spec.alarm].partition(' ')[2]} of the score"
-    yield "alarm", "the score itself" if spec.alarm == "score" else sums
+    yield "alarm", "the score itself" if spec.alarm == "score" else "CUSUM of the score"
     yield "trained on", _TRAINING[spec.training]
     yield "seed", "changes nothing" if spec.deterministic else "decides random draws"
     for i, (name, parameter) in enumerate(parameters_of(spec.parameters).items()):

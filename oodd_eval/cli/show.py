@@ -25,7 +25,7 @@ from oodd_eval.cli.terminal import TerminalReporter, summary
 from oodd_eval.data.facts import ENVIRONMENTS, in_order
 from oodd_eval.data.split import Split, load_split, split_directories
 from oodd_eval.errors import UsageError
-from oodd_eval.metrics.accumulation import STATISTICS
+from oodd_eval.metrics.alarms import STATISTICS
 from oodd_eval.metrics.catalogue import NAMES
 from oodd_eval.names import check_known, expression, select
 from oodd_eval.results.directory import ResultsDirectory
@@ -48,7 +48,7 @@ _format_options: Final = together(
     "show oodd-results --intervals",
     "show oodd-results --detector rf --metric missed_at_5pct",
     "show oodd-results --env hopper -k 'not drift' --csv",
-    "show oodd-results --alarm ewma",
+    "show oodd-results --alarm score",
 )
 @click.argument("directory", type=DIRECTORY, help="results directory")
 @click.option("--split", type=Name("splits"), help="where the split is, if not at its usual place")

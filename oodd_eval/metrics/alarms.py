@@ -9,20 +9,12 @@ scores and however they depend on one another within an episode.
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from oodd_eval.errors import UsageError
-from oodd_eval.metrics.accumulation import (
-    NOUNS,
-    Accumulation,
-    AlarmKind,
-    Ranks,
-    accumulated,
-    basis_of,
-)
 from oodd_eval.metrics.auc import AlarmRule, Contribution, mean_of
 from oodd_eval.metrics.binomial import incomplete_beta
 from oodd_eval.metrics.catalogue import FOUND_WITHIN, GUARANTEED, LEVELS
@@ -30,8 +22,11 @@ from oodd_eval.metrics.cusum import DRIFT, Standardization, cusum
 
 Floats = NDArray[np.float64]
 
-USUAL: Final[tuple[AlarmKind, ...]] = ("cusum", "score")
-"""Statistics that the detectors of the board declare, for sentences about both."""
+AlarmKind = Literal["cusum", "score"]
+"""Statistic of the guaranteed alarms: the CUSUM of the scores, or the score itself, for a detector
+that accumulates by itself."""
+
+STATISTICS: Final[tuple[AlarmKind, ...]] = get_args(AlarmKind)
 
 _ROUNDING: Final = 1e-9  # share of an episode that levels may be off: (n + 1) x 0.05 is whole
 
@@ -43,12 +38,9 @@ class GuaranteedAlarm:
     Parameters
     ----------
     standardization
-        Of the scores, for the CUSUM and other sums; their ranks, for the e-detector; None where the
-        score itself is the statistic.
+        Of the scores, for their CUSUM; None where the score itself is the statistic.
     threshold
         An episode alarms at the first row whose statistic is larger.
-    kind
-        The statistic, where the score itself is not.
 
     Examples
     --------
@@ -58,9 +50,8 @@ class GuaranteedAlarm:
     (19.0, 2, None)
     """
 
-    standardization: Standardization | Ranks | None
+    standardization: Standardization | None
     threshold: float
-    kind: AlarmKind = "cusum"
 
     @classmethod
     def fit(
@@ -82,8 +73,6 @@ class GuaranteedAlarm:
             ``"cusum"``: the CUSUM, without a new start after an alarm, of scores that the episodes
             number 0, 2, 4, ... standardize; the threshold is from the others. ``"score"``: the
             score itself, for a detector that accumulates by itself; the threshold is from all.
-            ``"ewma"``, ``"shiryaev-roberts"``, ``"e-detector"``: as the CUSUM, with another sum
-            (`oodd_eval.metrics.accumulation`).
         confidence
             See `quantile_rank`.
 
@@ -115,10 +104,7 @@ class GuaranteedAlarm:
         """Return the statistic of an episode, row by row; minus infinity where there is none."""
         if self.standardization is None:
             return np.where(np.isnan(scores), -np.inf, scores)
-        x = self.standardization(scores)
-        if self.kind == "cusum":
-            return cusum(x, threshold=math.inf)[0]
-        return accumulated(self.kind, x)
+        return cusum(self.standardization(scores), threshold=math.inf)[0]
 
     def largest(self, scores: Floats) -> float:
         """Return the largest statistic of an episode."""
@@ -155,7 +141,7 @@ class Calibration:
     """
 
     kind: AlarmKind
-    standardization: Standardization | Ranks | None
+    standardization: Standardization | None
     largest: tuple[float, ...]
     episodes: int
     rolling: bool = False
@@ -175,17 +161,17 @@ class Calibration:
         -------
         Calibration
         """
-        standardization, episodes = basis_of(kind, scores[0::2]), scores
-        if standardization is not None:
-            episodes = scores[1::2]
-        unbounded = GuaranteedAlarm(standardization, math.inf, kind)
+        standardization, episodes = None, scores
+        if kind == "cusum":
+            standardization, episodes = Standardization.fit(scores[0::2]), scores[1::2]
+        unbounded = GuaranteedAlarm(standardization, math.inf)
         largest = tuple(unbounded.largest(one) for one in episodes)
         return cls(kind, standardization, largest, len(scores))
 
     @property
     def unbounded(self) -> GuaranteedAlarm:
         """The statistic, with a threshold that nothing exceeds."""
-        return GuaranteedAlarm(self.standardization, math.inf, self.kind)
+        return GuaranteedAlarm(self.standardization, math.inf)
 
     def joined(self, largest: float) -> "Calibration":
         """Return a rolling calibration with a further nominal episode.
@@ -248,7 +234,7 @@ class Calibration:
         """
         threshold = self.threshold(level, confidence)
         if not math.isinf(threshold):
-            return GuaranteedAlarm(self.standardization, threshold, self.kind)
+            return GuaranteedAlarm(self.standardization, threshold)
         subject = f"at most {100 * level:.3g} % of nominal episodes with an alarm"
         if len(self.largest) < (n := least_rolling(level)) and self.rolling:
             needed = f"takes {n}" if math.isfinite(n) else "is more than any number can promise"
@@ -290,11 +276,10 @@ def too_few(
     >>> too_few("alpha=0.05", 30, 0.05, "cusum").partition(":")[0]
     'alpha=0.05 takes 38 calibration episodes, got 30'
     """
-    halved, whole = (least_episodes(level, one, confidence) for one in USUAL)
-    of_halves = NOUNS["cusum" if kind == "score" else kind]
+    halved, whole = (least_episodes(level, one, confidence) for one in STATISTICS)
     return (
         f"{subject} takes {whole if kind == 'score' else halved} calibration episodes, got "
-        f"{episodes}: {halved} for {of_halves} of the scores, which half of them standardize, "
+        f"{episodes}: {halved} for a CUSUM of the scores, which half of them standardize, "
         f"{whole} for the detector's own score as the "
         "statistic; "
         "record more, or promise less"
@@ -408,7 +393,7 @@ def offered_levels(episodes: int, kind: AlarmKind) -> dict[str, float]:
     episodes
         All of them, those that standardize the scores included.
     kind
-        The statistic: with all but the score itself half of them standardize the scores.
+        The statistic: for a CUSUM half of them standardize the scores.
 
     Returns
     -------
@@ -591,9 +576,6 @@ class Monitor:
     def reset(self) -> None:
         """Begin a new episode."""
         self._carried = 0.0
-        self._sums: Accumulation | None = None
-        if isinstance(self.rule, GuaranteedAlarm) and self.rule.kind not in USUAL:
-            self._sums = Accumulation(self.rule.kind)
         # A score that has not come yet is below every threshold.
         self.statistic = -math.inf if self.rule.standardization is None else 0.0
 
@@ -602,10 +584,6 @@ class Monitor:
         rule = self.rule
         if rule.standardization is None:
             self.statistic = -math.inf if math.isnan(score) else float(score)
-            return self.statistic > rule.threshold
-        if self._sums is not None:
-            x = float(rule.standardization(np.array([score]))[0])
-            self.statistic = self._sums.update(x)
             return self.statistic > rule.threshold
         drift = rule.drift if isinstance(rule, AlarmRule) else DRIFT
         x = float(rule.standardization(np.array([score]))[0]) - drift

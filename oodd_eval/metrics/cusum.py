@@ -128,28 +128,3 @@ def cusum(
             alarms[t] = True
             total = 0.0
     return statistic, alarms
-
-
-def detecta_alarms(
-    scores: Floats, *, drift: float = DRIFT, threshold: float = THRESHOLD
-) -> NDArray[np.int64]:
-    """Alarm times of the two-sided CUSUM on first differences of defined scores.
-
-    ``g+_t = max(0, g+_{t-1} + d_t - drift)``, ``g-_t = max(0, g-_{t-1} - d_t - drift)`` with
-    ``d_t = s_t - s_{t-1}``; an alarm when either exceeds the threshold, after which both start
-    again at 0. The released code of the paper applies this rule to raw scores; it is here for
-    comparison and enters no metric. Equal to ``detecta.detect_cusum(scores, threshold, drift,
-    ending=False)[0]`` of detecta 0.1.0.
-
-    >>> detecta_alarms(np.array([0.0, 0.0, 1.0, 1.0, 0.0]), drift=0.0, threshold=0.5).tolist()
-    [2, 4]
-    """
-    rise = fall = 0.0
-    times = []
-    for t, step in enumerate(np.diff(scores).tolist(), start=1):
-        rise = max(0.0, rise + step - drift)
-        fall = max(0.0, fall - step - drift)
-        if rise > threshold or fall > threshold:
-            times.append(t)
-            rise = fall = 0.0
-    return np.array(times, dtype=np.int64)

@@ -12,8 +12,13 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.metrics.accumulation import NOUNS, AlarmKind
-from oodd_eval.metrics.alarms import USUAL, Calibration, least_episodes, offered_levels
+from oodd_eval.metrics.alarms import (
+    STATISTICS,
+    AlarmKind,
+    Calibration,
+    least_episodes,
+    offered_levels,
+)
 from oodd_eval.metrics.catalogue import HEADLINE, LEVELS
 from oodd_eval.metrics.drift import SIGNIFICANT, PermutationTest, drift_test, two_sample_test
 
@@ -83,7 +88,7 @@ def promises(
     *,
     sensors: Sequence[str] = (),
     recorded: bool = True,
-    kinds: Sequence[AlarmKind] = USUAL,
+    kinds: Sequence[AlarmKind] = STATISTICS,
 ) -> list[PromiseFinding]:
     """Return what speaks for and against promises that are calibrated with these episodes.
 
@@ -115,7 +120,7 @@ def promises(
     return findings
 
 
-def enough_episodes(n: int, kinds: Sequence[AlarmKind] = USUAL) -> PromiseFinding:
+def enough_episodes(n: int, kinds: Sequence[AlarmKind] = STATISTICS) -> PromiseFinding:
     """Tell which levels a number of calibration episodes is enough for.
 
     Parameters
@@ -148,9 +153,7 @@ own score
 
 
 def _name(kind: AlarmKind) -> str:
-    if kind == "score":
-        return "a detector's own score"
-    return f"{NOUNS[kind]} of the scores"
+    return "a detector's own score" if kind == "score" else "a CUSUM of the scores"
 
 
 def achieved_share(

@@ -17,15 +17,20 @@ with the mean excess of the upper ones as its slope.
 import functools
 import math
 import zlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.metrics.accumulation import BETS, SHIFT, WEIGHT, AlarmKind, Ranks
-from oodd_eval.metrics.alarms import GuaranteedAlarm, offered_levels, quantile_rank, start_terms
+from oodd_eval.metrics.alarms import (
+    AlarmKind,
+    GuaranteedAlarm,
+    offered_levels,
+    quantile_rank,
+    start_terms,
+)
 from oodd_eval.metrics.auc import FAR_START
 from oodd_eval.metrics.cusum import DRIFT, THRESHOLD, UNIT, Standardization
 from oodd_eval.metrics.unpaired import UnpairedScores, unpaired_alarms
@@ -100,46 +105,11 @@ class Standards(NamedTuple):
         """Return those of one draw."""
         return Standardization(*(values[i].item() for values in self))
 
-    def __call__(self, scores: Floats) -> Floats:
-        """Return ``x_t`` as `Standardization` does, of scores (n,) in every draw: (draws, n)."""
-        mean, std = (values[:, None] for values in self)
-        x = UNIT * ((scores - mean) / np.where(std > 0, std, 1.0))
-        rise = np.where(np.isnan(scores), np.nan, np.where(scores > mean, np.inf, 0.0))
-        return np.where(std > 0, x, rise)
-
     @property
     def line(self) -> tuple[Floats, Floats]:
         """Slope and offset by draw: a score s enters the CUSUM as ``slope * s - offset``."""
         slope = np.where(self.std > 0, UNIT / np.where(self.std > 0, self.std, 1.0), _STEEP)
         return slope, slope * self.mean + DRIFT
-
-
-class DrawnRanks(NamedTuple):
-    """Ranks among the calibration scores of every draw.
-
-    Attributes
-    ----------
-    references
-        The scores of each calibration episode.
-    episodes
-        Numbers of the drawn ones: shape (draws, m).
-    """
-
-    references: Sequence[Floats]
-    episodes: NDArray[np.intp]
-
-    @classmethod
-    def fit(cls, scores: Sequence[Floats], episodes: NDArray[np.intp]) -> "DrawnRanks":
-        """Take the scores of the episodes, of which these are drawn."""
-        return cls(scores, episodes)
-
-    def of_draw(self, i: int) -> Ranks:
-        """Return the ranks of one draw."""
-        return Ranks.fit([self.references[k] for k in self.episodes[i]])
-
-    def all_draws(self) -> list[Ranks]:
-        """Return the ranks of every draw."""
-        return [self.of_draw(i) for i in range(len(self.episodes))]
 
 
 def thresholds(largest: Floats, draws: Drawn, rank: int) -> Floats:
@@ -202,34 +172,29 @@ class Recalibration:
         Of every second episode, for the guaranteed alarms; None where their statistic is the score.
     thresholds
         Of the guaranteed alarms by suffix: shape (draws,).
-    alarm
-        Their statistic.
     """
 
     standards: Standards
-    statistic: "Standards | DrawnRanks | None"
+    statistic: Standards | None
     thresholds: dict[str, Floats]
-    alarm: AlarmKind
 
     @classmethod
     def fit(cls, scores: Sequence[Floats], alarm: AlarmKind, environment: str) -> "Recalibration":
         """Draw the calibration episodes of an environment, given their scores."""
         draws = drawn(environment, len(scores))
         standards = Standards.fit(scores, draws.episodes)
-        statistic: Standards | DrawnRanks | None = None
+        statistic = None
         of_quantile, episodes = draws, scores
-        if alarm != "score":
-            basis = DrawnRanks if alarm == "e-detector" else Standards
-            statistic = basis.fit(scores[0::2], draws.half(0).episodes)
+        if alarm == "cusum":
+            statistic = Standards.fit(scores[0::2], draws.half(0).episodes)
             of_quantile, episodes = draws.half(1), scores[1::2]
         levels = offered_levels(len(scores), alarm)
-        largest = _largest(episodes, statistic, alarm) if levels else np.zeros((DRAWS, 0))
+        largest = _largest(episodes, statistic) if levels else np.zeros((DRAWS, 0))
         ranks = {s: quantile_rank(len(episodes), level) for s, level in levels.items()}
         return cls(
             standards,
             statistic,
             {suffix: thresholds(largest, of_quantile, rank) for suffix, rank in ranks.items()},
-            alarm,
         )
 
     def firsts(self, episodes: Sequence[Floats]) -> dict[str, Floats]:
@@ -244,7 +209,7 @@ class Recalibration:
                     rows[suffix][:, i] = np.where(first < len(scores), first, np.nan)
             return rows
         quiet = {suffix: np.ones(shape, dtype=bool) for suffix in self.thresholds}
-        for t, sums in enumerate(_statistics(episodes, self.statistic, self.alarm)):
+        for t, sums in enumerate(_sums(_stacked(episodes), self.statistic)):
             for suffix, threshold in self.thresholds.items():
                 alarms = (sums > threshold[:, None]) & quiet[suffix]
                 if alarms.any():
@@ -298,7 +263,7 @@ class Recalibration:
         for suffix, threshold in self.thresholds.items():
             for i, height in enumerate(threshold.tolist()):
                 basis = None if self.statistic is None else self.statistic.of_draw(i)
-                rule = _QuickAlarm(basis, height, self.alarm)
+                rule = _QuickAlarm(basis, height)
                 for name, terms in unpaired_alarms(cell, rule, rate).items():
                     values.setdefault(f"{name}_{suffix}", []).append(terms.value)
         return {name: np.array(of_draws) for name, of_draws in values.items()}
@@ -309,9 +274,7 @@ class _QuickAlarm(GuaranteedAlarm):
     """A guaranteed alarm whose CUSUM is right up to rounding, and needs no loop over rows."""
 
     def statistic(self, scores: Floats) -> Floats:
-        if not isinstance(self.standardization, Standardization) or (
-            self.kind != "cusum" or not self.standardization.std > 0
-        ):
+        if self.standardization is None or not self.standardization.std > 0:
             return GuaranteedAlarm.statistic(self, scores)
         x = self.standardization(scores) - DRIFT
         sums = np.cumsum(np.where(np.isnan(x), 0.0, x))
@@ -397,49 +360,15 @@ def _blocks(sizes: Sequence[int]) -> Iterator[list[int]]:
         yield block
 
 
-def _largest(
-    episodes: Sequence[Floats], statistic: Standards | DrawnRanks | None, kind: AlarmKind
-) -> Floats:
+def _largest(episodes: Sequence[Floats], statistic: Standards | None) -> Floats:
     """Return the largest statistic of each episode in every draw: shape (draws, episodes)."""
     if statistic is None:
         largest = [np.nanmax(s, initial=-np.inf) for s in episodes]
         return np.tile(np.array(largest), (DRAWS, 1))
-    highest = np.full((DRAWS, len(episodes)), 0.0 if kind == "cusum" else -np.inf)
-    for sums in _statistics(episodes, statistic, kind):
+    highest = np.zeros((DRAWS, len(episodes)))
+    for sums in _sums(_stacked(episodes), statistic):
         np.maximum(highest, sums, out=highest)
     return highest
-
-
-def _statistics(
-    episodes: Sequence[Floats], basis: Standards | DrawnRanks, kind: AlarmKind
-) -> Iterator[Floats]:
-    """Yield the statistic of every row in all draws, (draws, episodes): of none at ends its last.
-
-    Those of `oodd_eval.metrics.accumulation`, up to rounding.
-    """
-    if kind == "cusum" and isinstance(basis, Standards):
-        yield from _sums(_stacked(episodes), basis)
-        return
-    matrix = np.full((max(map(len, episodes), default=0), len(episodes)), np.nan)
-    for column, scores in zip(matrix.T, episodes, strict=True):
-        column[: len(scores)] = scores
-    if isinstance(basis, Standards):
-        values: Iterable[Floats] = (basis(row) for row in matrix)
-    else:
-        ranks = np.stack([one(matrix.ravel()) for one in basis.all_draws()])
-        values = np.moveaxis(ranks.reshape(DRAWS, *matrix.shape), 1, 0)
-    sums = np.zeros((len(BETS) if kind == "e-detector" else 1, DRAWS, matrix.shape[1]))
-    bets = np.array(BETS)[:, None, None]
-    for x in values:
-        with np.errstate(invalid="ignore"):
-            if kind == "ewma":
-                later = (1 - WEIGHT) * sums + WEIGHT * (x / UNIT)
-            elif kind == "shiryaev-roberts":
-                later = np.logaddexp(0.0, sums + SHIFT * (x / UNIT) - SHIFT**2 / 2)
-            else:
-                later = np.logaddexp(0.0, sums + np.log1p(bets * (x - 0.5)))
-        sums = np.where(np.isnan(x), sums, later)
-        yield np.logaddexp.reduce(sums) - math.log(len(sums))
 
 
 def _sums(matrix: Floats, standards: Standards) -> Iterator[Floats]:

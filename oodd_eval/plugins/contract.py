@@ -68,7 +68,7 @@ Copied = TypeVar("Copied")
 Progress: TypeAlias = Callable[[float], object]
 """A function that a long fit may call with the share of it that is done, from 0 to 1."""
 
-Alarm = Literal["cusum", "score", "ewma", "shiryaev-roberts", "e-detector"]
+Alarm = Literal["cusum", "score"]
 """Statistic of a detector's guaranteed alarms, see `oodd_eval.metrics.alarms.GuaranteedAlarm`."""
 
 Training = Literal["nominal", "simulation", "anomalies", "external", "oracle"]
@@ -241,9 +241,7 @@ class DetectorSpec:
         the true equations of the environment. Boards rank the first.
     alarm
         The statistic of the guaranteed alarms: ``"cusum"`` of standardized scores, or ``"score"``,
-        the score itself, for a detector that accumulates by itself. ``"ewma"`` forgets: it comes
-        down when a fault ends. ``"shiryaev-roberts"`` and ``"e-detector"`` are other sums
-        (`oodd_eval.metrics.accumulation`).
+        the score itself, for a detector that accumulates by itself.
     adapts
         ``"baseline"`` for a detector that learns from the first rows of each episode by itself,
         where these are declared nominal. Its factory is then called with their number, too, as

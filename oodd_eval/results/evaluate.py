@@ -21,8 +21,7 @@ from oodd_eval.data.split import Split
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import ContractError, ResultsError, UsageError
 from oodd_eval.metrics import alarms, recalibration, unpaired
-from oodd_eval.metrics.accumulation import AlarmKind
-from oodd_eval.metrics.alarms import Calibration, GuaranteedAlarm
+from oodd_eval.metrics.alarms import AlarmKind, Calibration, GuaranteedAlarm
 from oodd_eval.metrics.auc import AlarmRule, Contribution, auc_before, cell_contributions
 from oodd_eval.metrics.bootstrap import drawn_cell, mean_interval
 from oodd_eval.metrics.catalogue import HEADLINE, LEVELS, metric_info

@@ -95,7 +95,7 @@ class Record:
     inputs
         ``"observations"`` or ``"observations+actions"``.
     alarm
-        Statistic of its guaranteed alarms: ``"cusum"`` or another sum, or ``"score"`` for a
+        Statistic of its guaranteed alarms: ``"cusum"``, or ``"score"`` for a
         detector that accumulates by itself.
     deterministic
         Whether its seed changes nothing.

@@ -5,13 +5,12 @@ from itertools import islice
 
 from oodd_eval.data.baseline import Baseline, episode_means
 from oodd_eval.data.parts import EnvironmentData
-from oodd_eval.metrics.accumulation import AlarmKind
-from oodd_eval.metrics.alarms import USUAL
+from oodd_eval.metrics.alarms import STATISTICS, AlarmKind
 from oodd_eval.metrics.promise import EpisodeMeans, PromiseFinding, enough_episodes, promises
 
 
 def promises_of(
-    data: EnvironmentData, kinds: Sequence[AlarmKind] = USUAL, limit: int | None = None
+    data: EnvironmentData, kinds: Sequence[AlarmKind] = STATISTICS, limit: int | None = None
 ) -> list[PromiseFinding]:
     """Return what speaks for and against promises that rest on an environment of a split.
 

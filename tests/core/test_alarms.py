@@ -1,6 +1,7 @@
 """Guaranteed alarms: thresholds, what counts as found, and the promise itself, by simulation."""
 
 import math
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -9,8 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binom
 
+from oodd_eval.cli.main import main
 from oodd_eval.data.parts import CALIBRATION
 from oodd_eval.metrics.alarms import (
+    STATISTICS,
+    AlarmKind,
     GuaranteedAlarm,
     Monitor,
     guaranteed_contributions,
@@ -21,7 +25,8 @@ from oodd_eval.metrics.alarms import (
 from oodd_eval.metrics.auc import AlarmRule
 from oodd_eval.metrics.catalogue import FOUND_WITHIN, GUARANTEED, LEVELS, metric_info
 from oodd_eval.metrics.cusum import Standardization, cusum
-from oodd_eval.results.directory import ScoreFile
+from oodd_eval.plugins.contract import Alarm
+from oodd_eval.results.directory import ResultsDirectory, ScoreFile
 from oodd_eval.results.evaluate import Rules, cell_metrics, evaluated
 
 NAN = math.nan
@@ -304,6 +309,21 @@ def test_a_monitor_raises_the_alarms_of_the_whole_episode(seed):
     assert expected.any()
 
 
+@pytest.mark.parametrize("kind", STATISTICS)
+def test_a_monitor_gives_the_statistics_and_alarms_of_a_guaranteed_alarm_bit_for_bit(kind):
+    rng = np.random.default_rng(8)
+    calibration = [np.concatenate([[NAN], row]) for row in rng.normal(size=(19, 50))]
+    rule = GuaranteedAlarm.fit(calibration, 0.10, kind)
+    scores = np.concatenate([[NAN], rng.normal(size=40), rng.normal(size=40) + 3])
+    monitor = Monitor(rule)
+    for _ in range(2):
+        seen = [(monitor.update(score), monitor.statistic) for score in scores]
+        alarms, statistics = zip(*seen, strict=True)
+        assert statistics == tuple(rule.statistic(scores).tolist())
+        assert alarms.index(True) == rule.first(scores) > 40
+        monitor.reset()
+
+
 def test_a_monitor_begins_anew_with_each_episode():
     monitor = Monitor(AlarmRule(Standardization(0.0, 0.01), drift=0.0, threshold=3.0))
     assert [monitor.update(2.0), monitor.update(2.0)] == [False, True]
@@ -311,3 +331,27 @@ def test_a_monitor_begins_anew_with_each_episode():
     monitor.reset()
     assert monitor.statistic == 0
     assert not monitor.update(2.0)
+
+
+def test_the_contract_offers_the_statistics_that_there_are():
+    assert get_args(Alarm) == get_args(AlarmKind) == STATISTICS
+
+
+def test_show_computes_figures_with_another_statistic_and_stores_none(tmp_path, tiny_split, capsys):
+    command = [
+        "run", "--detector", "mahalanobis", "--env", "cartpole", "--anomaly", "iid", "-q",
+        "--split", str(tiny_split), "--output", str(tmp_path), "--jobs", "1",
+    ]  # fmt: skip
+    assert main(command) == 0
+    stored = (tmp_path / "records.jsonl").read_bytes()
+    shown = {}
+    for kind in (None, "cusum", "score"):
+        capsys.readouterr()
+        option = ["--alarm", kind] if kind else []
+        assert main(["show", str(tmp_path), "--csv", "--split", str(tiny_split), *option]) == 0
+        shown[kind] = capsys.readouterr().out
+    assert shown[None] == shown["cusum"] != ""
+    assert (tmp_path / "records.jsonl").read_bytes() == stored
+    assert [r.alarm for r in ResultsDirectory(tmp_path).records()] == ["cusum"]
+    assert main(["show", str(tmp_path), "--stored", "--alarm", "score"]) == 4
+    assert "--alarm score computes figures that --stored would not" in capsys.readouterr().err

@@ -9,8 +9,8 @@ from helpers_records import make_record
 
 from oodd_eval.data.split import load_split
 from oodd_eval.errors import ResultsError
-from oodd_eval.metrics.accumulation import STATISTICS, Ranks
 from oodd_eval.metrics.alarms import (
+    STATISTICS,
     GuaranteedAlarm,
     guaranteed_contributions,
     offered_levels,
@@ -58,10 +58,9 @@ def naive_rules(draw, kind):
     paper = AlarmRule(Standardization.fit(again))
     standardization, judged, chosen_judged = None, CALIBRATION, chosen
     if kind != "score":
-        basis = Ranks if kind == "e-detector" else Standardization
-        standardization = basis.fit(again[0::2])
+        standardization = Standardization.fit(again[0::2])
         judged, chosen_judged, spread = CALIBRATION[1::2], chosen[1::2] // 2, spread[1::2]
-    statistic = GuaranteedAlarm(standardization, math.inf, kind)
+    statistic = GuaranteedAlarm(standardization, math.inf)
     largest = [statistic.largest(scores) for scores in judged]
     m, ordered = len(judged), sorted(largest)
     levels = [
@@ -77,7 +76,7 @@ def naive_rules(draw, kind):
             threshold = ordered[-1] + (height - known[-1]) * excess
         else:
             threshold = float(np.interp(height, known, ordered))
-        rules[suffix] = GuaranteedAlarm(standardization, threshold, kind)
+        rules[suffix] = GuaranteedAlarm(standardization, threshold)
     return paper, rules
 
 

@@ -21,8 +21,7 @@ from oodd_eval.data.baseline import Baseline
 from oodd_eval.data.bounded import without_nan
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import ContractError, OoddError, UnknownNameError, UsageError
-from oodd_eval.metrics.accumulation import AlarmKind, Ranks
-from oodd_eval.metrics.alarms import GuaranteedAlarm
+from oodd_eval.metrics.alarms import AlarmKind, GuaranteedAlarm
 from oodd_eval.metrics.cusum import Standardization
 from oodd_eval.names import counted
 from oodd_eval.plugins.contract import AnyDetector
@@ -592,18 +591,15 @@ def _peers(episodes: Sequence[Episode], i: int) -> list[int]:
 def _statistic(kind: AlarmKind, scores: Sequence[Floats], peers: Sequence[int], i: int) -> Floats:
     """Return the statistic of an episode's scores.
 
-    A CUSUM and other sums standardize them with the median of its peers' means and of their
-    deviations, which no odd episode among them spoils; an e-detector ranks them among all of its
-    peers' scores.
+    A CUSUM standardizes them with the median of its peers' means and of their deviations, which no
+    odd episode among them spoils.
     """
-    standardization: Standardization | Ranks | None = None
-    if kind == "e-detector":
-        standardization = Ranks.fit(scores[j] for j in peers)
-    elif kind != "score":
+    standardization = None
+    if kind == "cusum":
         known = (Standardization.fit([scores[j]]) for j in peers)
         mean, std = np.nanmedian([[one.mean, one.std] for one in known], axis=0)
         standardization = Standardization(float(mean), float(std))
-    return GuaranteedAlarm(standardization, math.inf, kind).statistic(scores[i])
+    return GuaranteedAlarm(standardization, math.inf).statistic(scores[i])
 
 
 def _too_few(count: int, terms: _Terms) -> str:
