@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_info
 
-from oodd_eval.data import croissant, layout
+from oodd_eval.data import layout
 from oodd_eval.data.condition import Condition, conditions_of, ladder_of
 from oodd_eval.data.facts import ENVIRONMENTS, PART_OFFSETS, SplitDefinition, in_order
 from oodd_eval.data.files import only_writer, remove_abandoned, replacing
@@ -157,7 +157,6 @@ def build_split(
         if len(ordered) > len(todo):  # an earlier call may have had other packages
             versions = layout.read_manifest(directory)["versions"] | versions
         layout.write_manifest(directory, definition, ordered, GENERATOR_VERSION, versions)
-        croissant.write(Split(directory))
         shutil.rmtree(work)
     return directory
 

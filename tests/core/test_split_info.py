@@ -2,20 +2,24 @@
 
 import dataclasses
 import json
+import tomllib
+from pathlib import Path
 
 import minari
 import numpy as np
 import pytest
+import yaml
 from helpers_logs import UNPAIRED, log_parts, make_log_split, write_log_split
 from helpers_split import make_group
 
 from oodd_eval.cli.main import main
-from oodd_eval.data.facts import ENVIRONMENTS, TABLE1, LogFacts
+from oodd_eval.data.facts import ENVIRONMENTS, LICENCE, SPLITS, TABLE1, LogFacts
 from oodd_eval.data.info import collect_returns, describe, group_rows, log_rows, return_rows
-from oodd_eval.data.layout import write_environment, write_manifest
+from oodd_eval.data.layout import read_manifest, write_environment, write_manifest
 from oodd_eval.data.parts import NOMINAL
 from oodd_eval.data.split import load_split
 
+ROOT = Path(__file__).parents[2]
 KINDS = ("nominal", *TABLE1)
 
 
@@ -174,3 +178,24 @@ def test_labels_of_logs_are_metadata_of_an_export(logs, tmp_path, monkeypatch):
     assert (next(dataset.iterate_episodes([1])).observations == episode.observations).all()
     facts = json.loads((root / "oodd/arm/arm/train-v0/data/metadata.json").read_text())["logs"]
     assert (facts["licence"], facts["offsets"]) == ("CC BY 4.0", [5.4e6, 0, 0])
+
+
+def test_licence_is_the_same_everywhere():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["license"] == LICENCE
+    assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["license"] == LICENCE
+    assert (ROOT / "LICENSE").read_text().startswith(f"{LICENCE} License")
+    split = load_split("mini")
+    assert split.manifest["licence"] == LICENCE
+    assert f"\nlicence {LICENCE}\n" in describe(split)
+
+
+def test_the_licence_of_a_published_split_is_in_its_manifest_and_not_in_its_digest(tmp_path):
+    entries = load_split("mini").manifest["environments"]
+    write_manifest(tmp_path, SPLITS["mini"], entries, 2, {})
+    manifest = read_manifest(tmp_path)
+    assert manifest["licence"] == LICENCE
+    assert manifest["digest"] == load_split("mini").digest
+    older = {key: value for key, value in manifest.items() if key != "licence"}
+    (tmp_path / "manifest.json").write_text(json.dumps(older))
+    assert read_manifest(tmp_path)["digest"] == manifest["digest"]

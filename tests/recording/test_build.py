@@ -134,7 +134,7 @@ def test_seeds_that_are_drawn_need_their_bits(tmp_path, bits):
 
 def test_the_work_folder_goes_away_and_a_complete_split_is_kept(built):
     assert sorted(p.name for p in built.iterdir()) == [
-        "cartpole.h5", "croissant.json", "manifest.json"
+        "cartpole.h5", "manifest.json"
     ]  # fmt: skip
     before = (built / "cartpole.h5").stat().st_mtime_ns
     reports = []

@@ -36,7 +36,6 @@ def test_wheel_ships_data_policies_and_types(wheel):
         "oodd_riqn/py.typed",
         "oodd_recording/train/train.py",
         "oodd_eval/data/shipped/mini/manifest.json",
-        "oodd_eval/data/shipped/mini/croissant.json",
         "checks/oodd_checks/template/templates/pyproject.toml.in",
         "checks/oodd_checks/template/templates/gitignore.in",
         "oodd_eval/leaderboard/published.jsonl.xz",
