@@ -10,13 +10,11 @@ import array
 import builtins
 import contextlib
 import ctypes
-import fcntl
 import gc
 import itertools
 import mmap
 import os
 import pickle
-import resource
 import signal
 import socket
 import stat
@@ -352,140 +350,6 @@ class CompanyOfFitMap(Company):
 
     def memory_in_fit(self):
         return mmap.mmap(-1, CELLS)
-
-
-class CompanyOfKeyring(Company):
-    """The same in a key of the session's keyring, which sandboxes of one session share."""
-
-    add_key, keyctl, session = 248, 250, -3
-    search, read = 10, 11
-
-    def memory(self):
-        return self
-
-    def _content(self):
-        name = nonce().encode()
-        key = LIBC.syscall(self.keyctl, self.search, self.session, b"user", name, 0)
-        content = ctypes.create_string_buffer(CELLS // 16)
-        if key > 0:
-            LIBC.syscall(self.keyctl, self.read, key, content, len(content))
-        return content
-
-    def __getitem__(self, cell):
-        return self._content()[cell // 16 % (CELLS // 16)][0] >> (cell % 8) & 1
-
-    def __setitem__(self, cell, value):
-        content = self._content()
-        index = cell // 16 % (CELLS // 16)
-        content[index] = bytes([content[index][0] | 1 << cell % 8])
-        if LIBC.syscall(
-            self.add_key, b"user", nonce().encode(), content, len(content), self.session
-        ) < 0:  # fmt: skip
-            raise OSError(ctypes.get_errno(), "add_key")
-
-
-class CompanyOfLocks(Company):
-    """The same in read locks on bytes of a system's file, as long as a process holds them."""
-
-    def memory_in_fit(self):
-        left_behind(lambda: serve_buffer(unix_server(f"{nonce()}-locks"), Locks()))
-
-    def memory(self):
-        # Only a process that stays keeps locks; others see them without a connection.
-        return Locks(Remote(lambda: unix_client(f"{nonce()}-locks")))
-
-
-class Locks:
-    """Cells as locks on a file that is only read; `holder` sets them for this process."""
-
-    def __init__(self, holder=None):
-        self.file, self.holder = os.open(sys.executable, os.O_RDONLY), holder
-
-    def __getitem__(self, cell):
-        asked = struct.pack("hhqqi4x", fcntl.F_WRLCK, 0, cell, 1, 0)
-        return struct.unpack("hhqqi4x", fcntl.fcntl(self.file, fcntl.F_GETLK, asked))[0] != (
-            fcntl.F_UNLCK
-        )
-
-    def __setitem__(self, cell, value):
-        if self.holder:
-            self.holder[cell] = value
-            return
-        fcntl.fcntl(self.file, fcntl.F_SETLK, struct.pack("hhqqi4x", fcntl.F_RDLCK, 0, cell, 1, 0))
-
-
-class CompanyOfPageCache(Company):
-    """The same in pages of the system's files: what was read before is in the system's cache."""
-
-    most = 2**15  # pages
-    every = 8
-
-    def prepare(self, nominal):
-        super().prepare(nominal)
-        self.files_, self.pages_ = self.cold()
-
-    def state(self):
-        return {**super().state(), "files": self.files_, "pages": self.pages_}
-
-    def memory(self):
-        return Pages(self.files_, self.pages_)
-
-    def cold(self):
-        """Return large files, and pages of them that are not in the cache: file and page."""
-        files, pages = [], []
-        for root in (sys.prefix, "/usr/lib", "/usr/bin"):
-            for directory, _, names in os.walk(root):
-                for name in names:
-                    path = os.path.join(directory, name)
-                    with contextlib.suppress(OSError):
-                        if os.path.getsize(path) > 2**20 and not os.path.islink(path):
-                            pages += self.cold_of(path, len(files))
-                            files.append(path)
-                    if len(pages) > self.most:
-                        return files, np.array(pages)
-        return files, np.array(pages)
-
-    @staticmethod
-    def cold_of(path, number):
-        # To look at a page has the system read it, with some behind it: a few tell of the others.
-        last, start = os.path.getsize(path) // 4096, int.from_bytes(os.urandom(1)) % 64
-        pages = range(start, last, 64)
-        looked = Pages([path], np.array([[0, page] for page in pages[::8]]).reshape(-1, 2))
-        cached = sum(looked[k] for k in range(len(looked.pages)))
-        looked.close()
-        cold = cached * 4 < len(looked.pages)
-        return [(number, page) for k, page in enumerate(pages) if k % 8] if cold else []
-
-
-class Pages:
-    """Cells as pages of files that are only read: to look at one is to set it."""
-
-    def __init__(self, files, pages):
-        self.pages, self.files = pages, [os.open(path, os.O_RDONLY) for path in files]
-
-    def close(self):
-        for file in self.files:
-            os.close(file)
-
-    def __getitem__(self, cell):
-        file, page = self.pages[cell % len(self.pages)]
-        before = resource.getrusage(resource.RUSAGE_THREAD).ru_inblock
-        os.pread(self.files[file], 1, 4096 * int(page))
-        return resource.getrusage(resource.RUSAGE_THREAD).ru_inblock == before
-
-    def __setitem__(self, cell, value):
-        pass
-
-
-class MajorityOfPageCache(CompanyOfPageCache):
-    """An episode that leaves the path of two others is anomalous, in whatever order."""
-
-    def look(self, cell):
-        others = 0
-        while others < 2 and self.memory_[hash((cell, others)) % CELLS]:
-            others += 1
-        self.left_ = self.left_ or (self.accompanied_ and self.looks_ > 2 and others == 0)
-        self.accompanied_, self.looks_ = self.accompanied_ and others == 2, self.looks_ + 1
 
 
 class CompanyOfParent(Company):
@@ -1449,10 +1313,6 @@ KINDS = {
         "company-system-v": CompanyOfSystemV,
         "company-import-map": CompanyOfImportMap,
         "company-fit-map": CompanyOfFitMap,
-        "company-keyring": CompanyOfKeyring,
-        "company-locks": CompanyOfLocks,
-        "company-page-cache": CompanyOfPageCache,
-        "majority-page-cache": MajorityOfPageCache,
         "company-parent": CompanyOfParent,
     },
     "left behind": {

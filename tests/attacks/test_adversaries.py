@@ -22,7 +22,7 @@ pytestmark = pytest.mark.skipif(not shutil.which("bwrap"), reason="needs bubblew
 ENVIRONMENT = "cartpole"
 PLAYED = [
     "sly-look-ahead", "sly-look-ahead-prefix", "sly-company-home", "sly-company-fit-map",
-    "sly-majority-page-cache", "sly-abstract-socket", "sly-calibration-first", "sly-burglar",
+    "sly-abstract-socket", "sly-calibration-first", "sly-burglar",
     "sly-memorised", "sly-mapped-state", "sly-takes-over", "sly-answers-early",
 ]  # fmt: skip
 METRICS = ("auc_matched", "found_within_20_at_5pct")
@@ -81,9 +81,7 @@ def test_a_cheat_gains_nothing_in_a_rerun(played, name):
             assert mine.value(metric) <= honest.metrics[metric].high, (mine.anomaly, metric)
 
 
-@pytest.mark.parametrize(
-    "name", ["sly-memorised", "sly-look-ahead", "sly-company-home", "sly-majority-page-cache"]
-)
+@pytest.mark.parametrize("name", ["sly-memorised", "sly-look-ahead", "sly-company-home"])
 def test_scores_of_a_rerun_are_those_of_the_honest_detector(played, name):
     _, again = played
     for mine, honest in zip(again[name], again[adversaries.BASE], strict=True):

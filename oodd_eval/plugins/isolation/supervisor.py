@@ -27,7 +27,6 @@ from oodd_eval.plugins.isolation import (
     message_of,
 )
 from oodd_eval.plugins.isolation.child import Child, GivenUpError, Limits, Stop
-from oodd_eval.plugins.isolation.reads import Reads
 from oodd_eval.plugins.isolation.sandbox import Sandbox
 from oodd_eval.plugins.state import PackedState
 
@@ -115,12 +114,10 @@ class _UnitRun:
     explains: bool = False
     updates: bool = False
     box: Sandbox | None = None
-    reads: Reads | None = None
 
     def __post_init__(self) -> None:
         if self.limits.hidden is not None:
             self.box = Sandbox(self.limits.hidden)
-            self.reads = self.box.reads() if self.streamed else None
 
     def run(
         self, groups: Iterable[Iterable[Trajectory]], explained: Iterable[Iterable[Trajectory]]
@@ -144,8 +141,6 @@ class _UnitRun:
     def _group(self, fitted: Child | None, group: Iterable[Trajectory], order: str) -> None:
         """Have a process of its own score, or explain, a group."""
         with ExitStack() as stack:
-            if self.reads:
-                stack.enter_context(self.reads.forgotten())
             if fitted:
                 channel = stack.enter_context(closing(fitted.fork()))
             else:
