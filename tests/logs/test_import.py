@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from oodd_live import Watchdog
 from oodd_logs.importing import import_data
+from oodd_logs.minari_files import export
 from oodd_logs.readers import quantity
-from oodd_logs.readers.minari import export
 
 from oodd_eval import evaluate, load_split
 from oodd_eval.cli.main import main

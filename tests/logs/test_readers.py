@@ -17,9 +17,9 @@ from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from mcap_ros2.writer import Writer as Ros2Writer
 from oodd_logs import readers as logs
+from oodd_logs.minari_files import export
 from oodd_logs.readers import Reader, check_reader, library, readers, register_readers
 from oodd_logs.readers.cells import column_names, conventional, nearest_spelling
-from oodd_logs.readers.minari import export
 from oodd_logs.recording import Recording, Topic, parse_times
 from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.rosbag2 import StoragePlugin

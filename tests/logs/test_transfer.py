@@ -21,7 +21,7 @@ import h5py
 import numpy as np
 import pytest
 from helpers_split import edit_manifest, make_split
-from oodd_logs.readers import minari
+from oodd_logs import minari_files
 
 from oodd_eval import load_split
 from oodd_eval.cli.main import main
@@ -408,7 +408,7 @@ def test_an_ended_episode_is_terminated_and_a_capped_one_truncated(tmp_path):
 
     data = load_split(split).environment("cartpole")
     part = Ended(data._parts, "train")
-    minari._write(tmp_path / "d", "x-v0", data, part, load_split(split))
+    minari_files._write(tmp_path / "d", "x-v0", data, part, load_split(split))
     with h5py.File(tmp_path / "d" / "x-v0" / "data" / "main_data.hdf5") as file:
         for i in range(len(part)):
             episode, last = file[f"episode_{i}"], int(part.lengths[i]) - 1
@@ -422,8 +422,8 @@ def test_a_failed_export_leaves_no_half_dataset(tiny_split, tmp_path, monkeypatc
         if i == 3:
             raise OSError("disk full")
 
-    monkeypatch.setattr(minari, "_episode", fail)
+    monkeypatch.setattr(minari_files, "_episode", fail)
     with pytest.raises(OutputError, match="cannot be written to: disk full"):
-        minari.export(load_split(tiny_split), tmp_path, environments=["hopper"])
+        minari_files.export(load_split(tiny_split), tmp_path, environments=["hopper"])
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
     assert not list((tmp_path / "oodd" / "tiny" / "hopper").iterdir())

@@ -7,7 +7,7 @@ from oodd_eval.cli.console import make_console
 from oodd_eval.cli.data import split_argument
 from oodd_eval.data.split import load_split
 from oodd_eval.names import counted, select
-from oodd_logs.readers.minari import export as export_split
+from oodd_logs.minari_files import export as export_split
 
 
 @command("data export mini --format minari --output datasets")
