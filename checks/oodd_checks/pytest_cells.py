@@ -177,7 +177,7 @@ def _detectors(patterns: str, plugins: Plugins) -> list[str]:
 def _comparable(
     reference: RecordSet, split: Split, detectors: list[str], environments: list[str]
 ) -> RecordSet:
-    """Return a reference's cells of this split as it is here, of detectors at their defaults."""
+    """Return the reference cells whose split digest matches, of detectors at their defaults."""
     conditions = Conditions(split.name, split.digest, PROTOCOL, None)
     records = list(reference.boards.get(conditions, {}).values())
     chosen = [r for r in records if r.detector in detectors and r.environment in environments]

@@ -162,7 +162,7 @@ class Stream:
     ) -> None:
         self.limits, self.rate, self.baseline = limits, rate, baseline
         self._moving = np.isfinite(limits.still)
-        # Of what all sensors or the actions do; the first that is beyond its limit is told.
+        # Limits of whole-row faults; the first exceeded is reported.
         self._most = {
             (OBSERVATION, "missing"): MISSING,
             (OBSERVATION, "repeated"): 2 * float(limits.repeated) + 1,

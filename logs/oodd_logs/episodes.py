@@ -493,7 +493,7 @@ class _Maker:
                     yield from ((part, start, stop, inside, is_piece) for part in parts)
 
     def _takes_whole_windows(self, parts: Sequence[str], inside: Sequence[AnomalousRows]) -> bool:
-        """Tell whether ends shorter than a window are left out, as all but labelled ones are."""
+        """Whether a short last window is dropped (labelled ones are kept)."""
         return bool(NOMINAL_ROLES & {*parts} or (parts and not inside))
 
     def _windows(self, recorded: Recorded) -> dict[int, set[str]]:
@@ -794,10 +794,8 @@ class _Base:
         return cls(selection, converter, spool, recording.source, _choices(recording))
 
     def in_order(self, selection: Selection, recording: Recording) -> Selection:
-        """Return a selection with the columns of the first recording, in their order.
-
-        Globs may match further columns in later files: these are unused.
-        """
+        """Return a selection with the columns of the first recording, in their order."""
+        # Globs may match further columns in later files: these are unused.
         if selection == self.selection:
             return selection
         sensors, actions = (

@@ -199,7 +199,7 @@ def _left(plan: Plan, done: RunOutcome, *, fresh: bool) -> str:
 
 
 class _Doubts:
-    """Prints what puts promises on false alarms in doubt before there is any alarm."""
+    """Print findings about the data alone, except those that the tables repeat."""
 
     def __init__(self, console: Console, split: Split) -> None:
         self._console, self._split = console, split

@@ -237,11 +237,11 @@ class Calibration:
             return GuaranteedAlarm(self.standardization, threshold)
         subject = f"at most {100 * level:.3g} % of nominal episodes with an alarm"
         if len(self.largest) < (n := least_rolling(level)) and self.rolling:
-            needed = f"takes {n}" if math.isfinite(n) else "is more than any number can promise"
+            no_number = "is more than any number can promise"
+            needed = f"needs {n} episodes" if math.isfinite(n) else no_number
             raise UsageError(
-                f"{subject} from a rolling calibration, in which an episode counts {FADING} to the "
-                f"power of its age, {needed}, got {len(self.largest)} episodes that the threshold "
-                "is from: keep the first calibration, or promise less"
+                f"a rolling calibration {needed} at {100 * level:.3g} %, got {len(self.largest)}: "
+                "keep the first calibration, or promise less"
             )
         if self.episodes < least_episodes(level, self.kind, confidence):
             raise UsageError(too_few(subject, self.episodes, level, self.kind, confidence))

@@ -119,7 +119,7 @@ class Offering(Protocol):
         """Return its detectors, checked."""
 
     def from_spec(self, text: str) -> DetectorSpec | None:
-        """Return the detector that it makes of a name with a colon; None for one it handles not."""
+        """Return the detector for a `maker:name` text, or None if it does not know the maker."""
 
     def custom_specs(self) -> list[Spec]:
         """Return its environments and anomalies, checked."""
@@ -152,7 +152,7 @@ class Plugin:
         return printable(known.partition("\n")[0].removesuffix("."))
 
     def from_spec(self, text: str) -> DetectorSpec | None:
-        """Return the detector that it makes of a name with a colon; None for one it handles not."""
+        """Return the detector for a `maker:name` text, or None if it does not know the maker."""
         spec = self.hook.oodd_detector_from_spec(spec=text)
         if type(spec) not in (DetectorSpec, type(None)):
             expected = "None or a DetectorSpec whose name has a colon"
@@ -342,10 +342,8 @@ class Plugins:
             self.loaded[point.name] = plugin
 
     def _makers(self) -> Iterator[tuple[Offering, str]]:
-        """Yield plug-ins that make detectors of names with a colon, this distribution's first.
-
-        Each comes with the names that it knows.
-        """
+        """Yield plug-ins that make detectors of names with a colon, this distribution's first."""
+        # Each comes with the names that it knows.
         for point in self.points:
             if point in self._waiting:
                 self._load(point)

@@ -39,10 +39,8 @@ def _is_sound(point: EntryPoint, broken: list[BrokenMetadata]) -> bool:
 
 
 def _each(broken: list[BrokenMetadata]) -> list[EntryPoint]:
-    """Return the entry points of every sound distribution, and add the others to a list.
-
-    Of two with one name the first on the path counts, as it is the one that is imported.
-    """
+    """Return the entry points of every sound distribution, and add the others to a list."""
+    # Of two with one name the first on the path counts, as it is the one that is imported.
     points: dict[str, list[EntryPoint]] = {}
     for distribution in distributions():
         try:

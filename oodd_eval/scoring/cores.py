@@ -54,10 +54,8 @@ def _grants(root: Path) -> Iterator[float]:
 
 
 def _cgroups(root: Path) -> Iterator[Path]:
-    """Yield directories of the cgroups of this process, and of those that they are in.
-
-    Inside a container a cgroup may be named as from outside; its top is there in any case.
-    """
+    """Yield directories of the cgroups of this process, and of those that they are in."""
+    # Inside a container a cgroup may be named as from outside; its top is there in any case.
     lines = []
     with contextlib.suppress(OSError):
         lines = (root / "proc/self/cgroup").read_text(encoding="utf-8").splitlines()

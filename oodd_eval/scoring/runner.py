@@ -113,11 +113,9 @@ def run(
 
 
 def _slow(unit: Unit, plugins: Plugins) -> bool:
-    """Tell whether a unit may wait for others, whose figures can be seen early.
-
-    Detectors that need further libraries train networks and forests. What runs in this thread keeps
-    others from being begun.
-    """
+    """Tell whether a unit may wait for others, whose figures can be seen early."""
+    # Detectors that need further libraries train networks and forests. What runs in this thread
+    # keeps others from being begun.
     return unit.local or bool(plugins.offer(unit.setting.detector).spec.requires)
 
 
@@ -128,11 +126,9 @@ def _as_they_finish(
     results: ResultsDirectory | None,
     progressed: Callable[[int, float], None],
 ) -> Generator[tuple[int, Scored | None], None, None]:
-    """Yield places of jobs, with None as they begin, and with their scores as they finish.
-
-    In between `progressed` is called with places and shares of their fits, in this thread, too.
-    Only a few more units are begun than are taken, so that few scores are in memory.
-    """
+    """Yield places of jobs, with None as they begin, and with their scores as they finish."""
+    # In between `progressed` is called with places and shares of their fits, in this thread, too.
+    # Only a few more units are begun than are taken, so that few scores are in memory.
     end = math.inf if settings.deadline is None else time.monotonic() + settings.deadline
     # With twice as many, no thread is idle while records are made. What waits in the pool begins
     # later, however, which a deadline forbids.

@@ -77,10 +77,8 @@ class Estimate:
 def _estimate(
     samples: Sequence[Samples], sizes: Sequence[int], expected: int, seeds: int = 0
 ) -> Estimate:
-    """Return the mean over those of the expected environments where there is a number.
-
-    `sizes` are the numbers of test trajectories by environment.
-    """
+    """Return the mean over those of the expected environments where there is a number."""
+    # `sizes` are the numbers of test trajectories by environment.
     if not samples:
         return Estimate(expected=expected)
     mean = mean_samples(samples)

@@ -80,11 +80,9 @@ def pictures_of(experiment: Experiment, numbers: Numbers) -> dict[str, Picture]:
 
 
 def _panels(experiment: Experiment, numbers: Numbers, metrics: Sequence[str]) -> tuple[Panel, ...]:
-    """Return a panel for every metric and what does not stand along the axis, a colour per label.
-
-    Labels have a horizon before the colon. Means over models, or of too few environments, are left
-    to the tables: beside others they would mislead.
-    """
+    """Return a panel for each metric and value off the axis, with a colour per label."""
+    # Labels have a horizon before the colon. Means over models, or of too few environments, are
+    # left to the tables: beside others they would mislead.
     axis, scopes = experiment.picture.axis, {s.id: s for s in experiment.scopes}
     titles = experiment.row_titles
     labels = {

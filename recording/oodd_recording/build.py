@@ -380,10 +380,8 @@ def workers(jobs: int | None) -> Iterator[ProcessPoolExecutor]:
 
 
 def _begin(specs: Sequence[Spec], measured: Mapping[str, Measured]) -> None:
-    """Make known what the build knows, and end this worker when the build is killed.
-
-    It would wait for work forever.
-    """
+    """Make known what the build knows, and end this worker when the build is killed."""
+    # It would wait for work forever.
     register(specs)
     MEASURED.update(measured)
 

@@ -11,11 +11,10 @@ with importing("gym"):
 
 
 class _Acrobot(AcrobotEnv):
-    """Acrobot whose gravity can be changed: the stock equations hold it as a local constant.
+    """Acrobot whose gravity can be changed: the stock equations hold it as a local constant."""
 
-    They stay in force until then; after, the same pendulum is solved from its mass matrix, with
-    `friction` in both joints, in 1/s.
-    """
+    # They stay in force until then; after, the same pendulum is solved from its mass matrix, with
+    # `friction` in both joints, in 1/s.
 
     gravity, friction = 9.8, 0.0
 

@@ -213,10 +213,8 @@ def _ar1(environment: str, strength: float, _: Simulator, rng: np.random.Generat
 
 
 def _varma(environment: str, strength: float, _: Simulator, rng: np.random.Generator) -> Fault:
-    """x_t = A x_{t-1} + e_t + 0.4 e_{t-1}, e_t correlated by .5, scaled to the variance of iid.
-
-    A has 0.7 on its diagonal, and -0.2 from each sensor to the next.
-    """
+    """x_t = A x_{t-1} + e_t + 0.4 e_{t-1}, e_t correlated by .5, scaled to the variance of iid."""
+    # A has 0.7 on its diagonal, and -0.2 from each sensor to the next.
     sensors = choose_sensors(environment, rng)
     k = len(sensors)
     a = 0.7 * np.eye(k) - (0.2 * np.eye(k, k=1) if k > 1 else 0)

@@ -88,10 +88,8 @@ def code_digest(environment: str, kinds: Iterable[str]) -> str:
 
 
 def _package_of(file: Path) -> dict[str, Path]:
-    """Return the files of the outermost package that a file is in, by name, or the file alone.
-
-    Hidden ones and caches are left out.
-    """
+    """Return the files of the outermost package that a file is in, by name, or the file alone."""
+    # Hidden ones and caches are left out.
     package = file
     while (package.parent / "__init__.py").exists():
         package = package.parent

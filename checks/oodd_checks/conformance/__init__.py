@@ -58,7 +58,7 @@ class Result:
         if reason is not None and self.status == "failed":
             return replace(self, status="xfailed", message=f"{reason} [{self.message}]")
         if reason is not None and self.status == "passed":
-            message = f"expected to fail ({reason}): take it from the expected failures"
+            message = f"expected to fail ({reason}): remove it from expected_failures"
             return replace(self, status="xpassed", message=message)
         return self
 

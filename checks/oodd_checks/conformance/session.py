@@ -81,10 +81,8 @@ class _Session:
 
 
 def _fixtures(trial: Trial) -> ModuleType:
-    """Return a pytest plug-in that gives the tests their detector.
-
-    A module: pytest deprecates fixtures of instances that last longer than a test.
-    """
+    """Return a pytest plug-in that gives the tests their detector."""
+    # A module: pytest deprecates fixtures of instances that last longer than a test.
     fixtures = ModuleType("oodd_eval_detector")
     vars(fixtures)["detector"] = pytest.fixture(scope="session", name="detector")(lambda: trial)
     return fixtures

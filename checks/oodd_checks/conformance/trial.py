@@ -204,11 +204,9 @@ def noisy_from(trajectory: Trajectory, row: int) -> Trajectory:
 
 @functools.lru_cache(maxsize=256)
 def _system(key: int, rows: int, sensors: int) -> tuple[Floats, Floats]:
-    """Return observations and actions of a nominal episode of a linear-Gaussian system.
-
-    A two-dimensional state turns and decays, actions push it, and every sensor sees a combination
-    of it in units of its own, with noise.
-    """
+    """Return observations and actions of a nominal episode of a linear-Gaussian system."""
+    # A two-dimensional state turns and decays, actions push it, and every sensor sees a combination
+    # of it in units of its own, with noise.
     system = np.random.default_rng(sensors)
     mixing = system.normal(size=(2, sensors))
     scale = 10.0 ** system.integers(-1, 2, size=sensors)

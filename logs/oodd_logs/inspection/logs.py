@@ -422,11 +422,9 @@ def _unnamed(recording: Recording) -> bool:
 
 
 def _exchanged(matrices: Sequence[tuple[Path, Recording]]) -> set[Path]:
-    """Return the files whose rows are columns.
-
-    The first row counts like a clock, or there are as many rows as neighbours have columns, or
-    there is no neighbour to compare with and there are three times as many columns as rows.
-    """
+    """Return the files whose rows are columns."""
+    # The first row counts like a clock, or there are as many rows as neighbours have columns, or
+    # there is no neighbour to compare with and there are three times as many columns as rows.
     topics = [(file, next(iter(recording.topics.values()))) for file, recording in matrices]
     tall = Counter(len(t.names) for _, t in topics if t.rows > len(t.names))
     exchanged = set()

@@ -87,10 +87,8 @@ def _episodes(file: StoredFile, group: str, depth: int) -> list[str]:
 def _arrays(
     file: StoredFile, group: str, prefix: str, depth: int
 ) -> Iterator[tuple[str, MatrixRows]]:
-    """Yield the arrays below a group by their names relative to the episode.
-
-    Left out are those that repeat others, shifted by a row, and texts.
-    """
+    """Yield the arrays below a group by their names relative to the episode."""
+    # Left out are those that repeat others, shifted by a row, and texts.
     for name, rows in file.members(group).items():
         if name in _LEFT_OUT:
             continue

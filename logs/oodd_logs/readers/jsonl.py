@@ -57,10 +57,8 @@ def _objects(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
 
 
 def _episode(value: Mapping[str, Any], source: str) -> tuple[Topic, dict[str, Any]] | None:
-    """Return the rows and the fields of an object that is an episode; None for one that is a row.
-
-    An episode has a list of objects, one a step, or lists of rows of numbers.
-    """
+    """Return the rows and the fields of an object that is an episode; None for a row."""
+    # An episode has a list of objects, one a step, or lists of rows of numbers.
     steps = [k for k, v in value.items() if isinstance(v, list) and v and isinstance(v[0], dict)]
     if len(steps) == 1:
         rows = Gathered(source)

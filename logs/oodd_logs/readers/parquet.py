@@ -21,10 +21,9 @@ _PER_SECOND: Final = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 
 @dataclass(frozen=True, slots=True)
 class _Leaf:
-    """One column of numbers or texts: where it is in a column of the file.
+    """One column of numbers or texts: where it is in a column of the file."""
 
-    `path` has the fields of structures and positions in lists, as names and numbers.
-    """
+    # `path` has the fields of structures and positions in lists, as names and numbers.
 
     column: str
     path: tuple[str | int, ...]
@@ -135,10 +134,8 @@ def _count(batch: Mapping[str, Column]) -> int:
 
 
 def _leaves(column: str, kind: Any, first: Any, path: Path) -> list[_Leaf]:
-    """Return the columns in one of the file: fields of structures, items of lists.
-
-    Lists have as many items as their type says, or those of the first row with any.
-    """
+    """Return the columns in one of the file: fields of structures, items of lists."""
+    # Lists have as many items as their type says, or those of the first row with any.
     value = None
     if first is not None and column in first.schema.names:
         value = next((cell.as_py() for cell in first.column(column) if cell.is_valid), None)

@@ -41,10 +41,8 @@ def _open(path: Path, options: Options) -> Iterator[Recording]:
 
 
 def _types(connections: Sequence[Any]) -> Any:
-    """Return the types of a bag's messages: those that it defines, and those of ROS itself.
-
-    The library makes code of definitions: only names and numbers may get into it.
-    """
+    """Return the types of a bag's messages: those that it defines, and those of ROS itself."""
+    # The library makes code of definitions: only names and numbers may get into it.
     typesys, formats = library("rosbags.typesys"), library("rosbags.interfaces")
     defined: dict[str, Any] = {}
     without = [c for c in connections if c.msgdef.format == formats.MessageDefinitionFormat.NONE]

@@ -239,11 +239,9 @@ class _Block:
         return columns or [np.empty(0) for _ in range(width)]
 
     def _numbers(self) -> list[_Cells] | None:
-        """Return the columns of a block where every cell is a plain number, but for the last row.
-
-        Rows of that kind are most there are, and NumPy reads them in half of the time. The last row
-        may lack cells: nothing is commanded after the last observation.
-        """
+        """Return the columns of a block where every cell but the last row's is a plain number."""
+        # Rows of that kind are most there are, and NumPy reads them in half of the time. The last
+        # row may lack cells: nothing is commanded after the last observation.
         body, newline, end = self.text.rstrip("\n").rpartition("\n")
         layout, width = self.layout, len(self.layout.names)
         try:

@@ -119,11 +119,9 @@ def stream_faults(
 
 
 def _common(others: Mapping[str, Floats], spread: Floats, p: float) -> StreamLimits:
-    """Return limits of the stream from those of single other episodes.
-
-    The range ends as far beyond that of all others as it is wide: what moves from day to day is
-    for the p-value to judge.
-    """
+    """Return limits of the stream from those of single other episodes."""
+    # The range ends as far beyond that of all others as it is wide: what moves from day to day is
+    # for the p-value to judge.
     low, high = others["low"].min(axis=0), others["high"].max(axis=0)
     with np.errstate(invalid="ignore"):
         width = np.where(np.isfinite(low) & np.isfinite(high), high - low, np.inf)
@@ -139,11 +137,9 @@ def _common(others: Mapping[str, Floats], spread: Floats, p: float) -> StreamLim
 
 
 def _most(longest: Floats, p: float) -> Floats:
-    """Return half of what other episodes' longest runs, (n, columns), would allow.
-
-    That is the longest of all but the oddest fifth of them, or more where runs vary: half of the
-    length that has so small a p-value, as the stream allows twice the limit.
-    """
+    """Return half of what other episodes' longest runs, (n, columns), would allow."""
+    # That is the longest of all but the oddest fifth of them, or more where runs vary: half of the
+    # length that has so small a p-value, as the stream allows twice the limit.
     usual = np.quantile(longest, 1 - ODD_SHARE, axis=0, method="nearest")
     tails = map(Tail.fit, longest.T)
     # Where all but a few are alike, the few tell nothing of what is usual.

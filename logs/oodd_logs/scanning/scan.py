@@ -473,10 +473,9 @@ def _all(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Judged:
-    """One episode with what a detector and the stream say about it.
+    """One episode with what a detector and the stream say about it."""
 
-    Of the trajectory the first `baseline` rows are what readings are compared with.
-    """
+    # Of the trajectory the first `baseline` rows are what readings are compared with.
 
     episode: Episode
     scores: Floats
@@ -497,11 +496,10 @@ class _Judged:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Terms:
-    """Comparison of statistics: with those of `reference`, by default of the other episodes.
+    """Comparison of statistics: with those of `reference`, by default of the other episodes."""
 
-    If `exact`, these are enough for p-values by rank. Where they are too few for any, what is above
-    the limit is odd.
-    """
+    # If `exact`, these are enough for p-values by rank. Where they are too few for any, what is
+    # above the limit is odd.
 
     judge: str
     fdr: float
@@ -589,11 +587,9 @@ def _peers(episodes: Sequence[Episode], i: int) -> list[int]:
 
 
 def _statistic(kind: AlarmKind, scores: Sequence[Floats], peers: Sequence[int], i: int) -> Floats:
-    """Return the statistic of an episode's scores.
-
-    A CUSUM standardizes them with the median of its peers' means and of their deviations, which no
-    odd episode among them spoils.
-    """
+    """Return the statistic of an episode's scores."""
+    # A CUSUM standardizes them with the median of its peers' means and of their deviations, which
+    # no odd episode among them spoils.
     standardization = None
     if kind == "cusum":
         known = (Standardization.fit([scores[j]]) for j in peers)
@@ -616,10 +612,8 @@ def _too_few(count: int, terms: _Terms) -> str:
 def _blame(
     judged: _Judged, usual: float, interval: tuple[int, int], others: Floats
 ) -> tuple[int, Floats]:
-    """Return the row with which an excursion began, and the share of each sensor in it, (D,).
-
-    It is above the threshold in the interval; before it the statistic was above what is usual.
-    """
+    """Return the row with which an excursion began, and the share of each sensor in it, (D,)."""
+    # It is above the threshold in the interval; before it the statistic was above what is usual.
     row, stop = interval
     if judged.explanation is not None and judged.explanation.onsets[row] >= 0:
         return int(judged.explanation.onsets[row]), judged.explanation.shares[row]

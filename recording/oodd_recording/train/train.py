@@ -106,12 +106,11 @@ def _make_learner(environment: str, algorithm: str, seed: int) -> Learner:
 
 
 class _Journal:
-    """Curve, best actor and checkpoint of one training, all in one directory.
+    """Curve, best actor and checkpoint of one training, all in one directory."""
 
-    The best actor is the one whose worst return over a hundred selection episodes, the same for
-    every candidate, is largest: a policy that sometimes falls makes a poor nominal one, and one
-    start in fifty that falls shows neither in forty episodes nor in their mean.
-    """
+    # The best actor is the one whose worst return over a hundred selection episodes, the same for
+    # every candidate, is largest: a policy that sometimes falls makes a poor nominal one, and one
+    # start in fifty that falls shows neither in forty episodes nor in their mean.
 
     def __init__(
         self, environment: str, out: Path, facts: dict[str, Any], progress: Progress
