@@ -62,6 +62,29 @@ def test_paper_auc_compares_scores_from_the_onset_on_with_those_before():
     assert found["auc_null"].value == 0
 
 
+@pytest.mark.parametrize(
+    ("scores", "onset", "expected"),
+    [
+        # 2, 3, 5 after 1, 4: wins of 1, 1 and 2 pairs.
+        ([1, 4, 2, 3, 5], 2, 4 / 6),
+        # 4, 2, 3, 5 after 1 alone; a row of the onset left out would change nothing here.
+        ([1, 4, 2, 3, 5], 1, 1),
+        # 3 ties with 3: the row of the onset itself counts.
+        ([3, 1, 2, 3, 0, 2], 3, (2.5 + 0 + 1.5) / 9),
+        ([NAN, 1, 4, NAN, 2, 5], 3, 3 / 4),
+        ([1, 2], 0, NAN),
+        ([1, 2], 2, NAN),
+    ],
+)
+def test_paper_auc_in_worked_numbers(scores, onset, expected):
+    flat = np.zeros(len(scores))
+    found = auc_contributions([np.array(scores, float), flat], [flat] * 2, [onset, 1])
+    assert found["auc"].numerator[0] == pytest.approx(np.nan_to_num(expected), abs=1e-15)
+    assert found["auc"].denominator[0] == (not math.isnan(expected))
+    twin = auc_contributions([flat], arrays(scores), [onset])
+    assert twin["auc_null"].value == pytest.approx(expected, abs=1e-15, nan_ok=True)
+
+
 def test_matched_auc_compares_the_same_times_of_anomalous_and_twin():
     # Times 1 and 2: the twin ends there.
     found = auc_contributions(arrays([9, 1, 2, 50]), arrays([9, 1, 1]), [1])

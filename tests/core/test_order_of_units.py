@@ -1,4 +1,7 @@
-"""Units that share a fit: it is made once, and no thread waits while there is other work."""
+"""Units that share a fit: it is made once, and no thread waits while there is other work.
+
+And the groups in which the trajectories of a unit are scored.
+"""
 
 import threading
 import time
@@ -9,7 +12,7 @@ import pytest
 
 from oodd_eval.scoring.executors import RunSettings
 from oodd_eval.scoring.runner import _as_they_finish
-from oodd_eval.scoring.unit import Scored
+from oodd_eval.scoring.unit import Scored, groups
 
 
 def jobs_of(text):
@@ -159,3 +162,29 @@ def test_units_go_on_while_the_caller_is_busy():
     next(finished)
     assert second.wait(10)
     finished.close()
+
+
+@pytest.mark.parametrize(
+    ("sizes", "expected"),
+    [
+        # Twins: as many in a group as there are test seeds, and what is left of the calibration.
+        ((5, 3, 3), [3, 2, 3, 3]),
+        ((6, 3, 3), [3, 3, 3, 3]),
+        # Without twins the smallest test part decides, a part without episodes does not.
+        ((20, 12, 30, 0), [12, 8, 12, 12, 12, 6]),
+        ((30, 40, 9, 10), [9, 9, 9, 3, 9, 9, 9, 9, 4, 9, 9, 1]),
+        # But no group of a few: each takes a process.
+        ((10, 3, 9), [8, 2, 3, 8, 1]),
+        ((2, 1), [1, 1, 1]),
+        ((2,), [1, 1]),
+    ],
+)
+def test_the_smallest_test_part_is_the_size_of_groups(sizes, expected):
+    parts = ("calibration", "test/nominal", "test/iid", "test/drift")
+    sizes = dict(zip(parts, sizes, strict=False))
+    drawn = groups(sizes)
+    assert list(map(len, drawn)) == expected
+    assert [member for group in drawn for member in group] == [
+        (part, i) for part, n in sizes.items() for i in range(n)
+    ]
+    assert all(len({member.part for member in group}) == 1 for group in drawn)
