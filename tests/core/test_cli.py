@@ -5,7 +5,6 @@ import io
 import math
 import os
 import re
-import shlex
 import shutil
 import subprocess
 import sys
@@ -13,16 +12,15 @@ import time
 from pathlib import Path
 
 import pytest
-from helpers_docs import parse
+from click.shell_completion import ShellComplete
 from helpers_plugins import install
 from helpers_split import make_split
 from rich.console import Console
 
-from oodd_eval import cli as cli_package
 from oodd_eval.cli import listing
 from oodd_eval.cli import main as cli
 from oodd_eval.cli import run as run_module
-from oodd_eval.errors import MissingExtraError
+from oodd_eval.errors import UnknownNameError
 from oodd_eval.metrics.catalogue import PAPER
 from oodd_eval.scoring import display
 
@@ -54,7 +52,6 @@ def clock(tiny_split, tmp_path_factory):
     return place / "oodd-results"
 
 
-BUILD = ["data", "build", "dev", "--train=1", "--calibration=1", "--test=1", "--seed-base=90"]
 CLOCK = ("run", "--detector", "clock", "--env", "cartpole", "--split", "tiny", "--jobs", "1")
 
 
@@ -69,17 +66,13 @@ def test_a_run_prints_and_writes_its_results(run, tmp_path):
     assert "\x1b" not in out
     assert max(map(len, out.splitlines())) <= 80
     # A second run takes over what is there, and the report has the rows of both.
-    assert "8 ok (8 from earlier runs) in" in run(*CLOCK)[1]
-    assert "clock" not in run(*CLOCK, "--detector", "random")[1]
+    out = run(*CLOCK, "-v")[1]
+    assert "8 ok (8 from earlier runs) in" in out
+    assert "tiny/cartpole/iid::clock[h=1,seed=0]" in out
+    assert re.fullmatch(r"8 ok in \d+\.\d s\n", run(*CLOCK, "--detector", "random", "-q")[1])
     report = (tmp_path / "oodd-results" / "report.md").read_text()
     assert "| clock " in report
     assert "| random " in report
-
-
-def test_quiet_and_verbose(run):
-    assert re.fullmatch(r"8 ok in \d+\.\d s\n", run(*CLOCK, "-q")[1])
-    assert "ok           tiny/cartpole/iid::clock[h=1,seed=0]" in run(*CLOCK, "-v")[1]
-    assert "Traceback" in run(*CLOCK, "-v", "--env", "nowhere")[2]
 
 
 def test_collect_only_prints_cells_and_does_nothing(run, tmp_path):
@@ -92,6 +85,16 @@ def test_collect_only_prints_cells_and_does_nothing(run, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.fixture
+def plugin(monkeypatch, tmp_path_factory):
+    """Install a plug-in of a name and code."""
+
+    def installed(name, code, **settings):
+        install(monkeypatch, tmp_path_factory.mktemp("plugin"), name, code, **settings)
+
+    return installed
+
+
 FAILING = """
 class Fails(Good):
     def score(self, x): raise RuntimeError("no")
@@ -100,11 +103,12 @@ class Fails(Good):
 def oodd_detectors():
     return [DetectorSpec("fails", Fails, "", parameters=declared_by({"size": 5}))]
 """
+FAILS = ("run", "--detector", "fails", "--env", "cartpole", "--split", "tiny")
 
 
 @pytest.fixture
-def failing(monkeypatch, tmp_path_factory):
-    install(monkeypatch, tmp_path_factory.mktemp("plugin"), "fails", FAILING)
+def failing(plugin):
+    plugin("fails", FAILING)
 
 
 MENDED = FAILING.replace('raise RuntimeError("no")', "return super().score(x)").replace(
@@ -112,64 +116,44 @@ MENDED = FAILING.replace('raise RuntimeError("no")', "return super().score(x)").
 )
 
 
-def test_a_later_attempt_replaces_a_failed_one(run, failing, monkeypatch, tmp_path_factory):
-    selected = ("run", "--detector", "fails", "--env", "cartpole", "--split", "tiny")
-    code, out, _ = run(*selected)
+def test_a_later_attempt_replaces_a_failed_one(run, failing, plugin, tmp_path):
+    code, out, _ = run(*FAILS, "-v")
     assert code == 1
-    assert "ERROR cartpole/fails[h=1,seed=0]: RuntimeError: no" in out
-    assert run("show", "oodd-results")[0] == 1
-    install(monkeypatch, tmp_path_factory.mktemp("mended"), "fails", MENDED, version="1.1")
-    code, out, _ = run(*selected)
-    assert code == 0, out
-    assert re.search(r"^8 ok in", out, re.MULTILINE)
-    assert "ERROR" not in out
-    assert "8 ok\n" in run("show", "oodd-results")[1]
-    assert run("show", "oodd-results")[0] == 0
-
-
-def test_verbose_prints_the_log_of_a_failed_unit_with_its_place(run, failing, tmp_path):
-    selected = ("run", "--detector", "fails", "--env", "cartpole", "--split", "tiny")
-    _, out, _ = run(*selected, "-v")
     (place,) = re.findall(r"^  (oodd-results/logs/\S+\.txt):$", out, re.MULTILINE)
     assert "Traceback (most recent call last)" in (tmp_path / place).read_text()
     assert out.count("Traceback (most recent call last)") == 1
-    assert "Traceback" not in run(*selected)[1]
+    code, out, _ = run(*FAILS)
+    assert code == 1
+    assert "ERROR cartpole/fails[h=1,seed=0]: RuntimeError: no" in out
+    assert "Traceback" not in out
+    assert run("show", "oodd-results")[0] == 1
+    plugin("fails", MENDED, version="1.1")
+    code, out, _ = run(*FAILS)
+    assert code == 0, out
+    assert "8 ok in" in out
+    assert run("show", "oodd-results")[0] == 0
 
 
 def test_x_stops_at_the_first_failure(run, failing):
-    code, out, _ = run(
-        "run", "--detector", "fails,clock", "--env", "all", "--split", "tiny", "--jobs", "1", "-x"
-    )
+    several = ("run", "--detector", "fails,clock", "--env", "all", "--split", "tiny", "--jobs", "1")
+    code, out, _ = run(*several, "-x")
     assert code == 1
     assert re.search(r"^8 error in", out, re.MULTILINE)
-    assert out.splitlines()[-1] == "0 of 4 fits are kept; the same command continues"
+    assert out.splitlines()[-1].startswith("0 of 4 fits are kept; ")
+    last = run(*several, "--fresh", "-q", "--env", "cartpole")[1].splitlines()[-1]
+    assert last.startswith("1 of 2 fits is kept; ")
+    assert "without --fresh" in last
 
 
-@pytest.mark.parametrize(
-    ("arguments", "last"),
-    [
-        (["--detector=fails"], "0 of 1 fit is kept; the same command fits it again"),
-        (["--detector=fails,clock"], "1 of 2 fits is kept; the same command fits the other again"),
-        (
-            ["--detector=fails,clock", "--fresh"],
-            "1 of 2 fits is kept; the same command without --fresh fits the other again",
-        ),
-    ],
-)
-def test_the_last_line_of_a_run_with_failures_says_what_is_kept(run, failing, arguments, last):
-    _, out, _ = run(*CLOCK, *arguments)
-    assert out.splitlines()[-1] == last
-    _, out, _ = run(*CLOCK, *arguments)
-    assert out.splitlines()[-1] == last
-
-
-def test_the_last_line_of_a_run_without_an_extra_says_to_install_it(run, monkeypatch):
-    monkeypatch.setitem(sys.modules, "torch", None)
-    code, out, _ = run("run", "--detector=pe", "--env=cartpole", "--split=tiny")
+def test_a_run_without_an_extra_says_to_install_it(run, monkeypatch, plugin):
+    far = 'DetectorSpec("far", Good, "", requires=("no_such",), extra="oodd-far[all]")'
+    plugin("far", f"@hookimpl\ndef oodd_detectors(): return [{far}]")
+    remedy = 'needs no_such: pip install "oodd-far[all]"'
+    assert remedy in run("list", "detectors")[1]
+    code, out, _ = run("run", "--detector", "far", "--env", "cartpole", "--split", "tiny")
     assert code == 1
-    assert out.count("pip install") == out.count("needs torch") == 1
-    last = "0 of 1 fit is kept; install what is named above, then the same command fits it"
-    assert out.splitlines()[-1] == last
+    assert "8 unavailable in" in out
+    assert out.count("pip install") == 1
 
 
 SLOW = """
@@ -186,24 +170,23 @@ def oodd_detectors():
 """
 
 
-def test_a_run_says_how_far_a_long_fit_is(run, monkeypatch, tmp_path_factory):
-    install(monkeypatch, tmp_path_factory.mktemp("plugin"), "slow", SLOW)
-    slow = (*CLOCK, "--detector", "slow", "--fresh")
-    assert "slow on cartpole" not in run(*slow)[1]
-    monkeypatch.setattr(display, "SILENCE", 0.25)
-    code, out, _ = run(*slow)
+@pytest.mark.parametrize(("silence", "shown"), [(0.15, True), (60, False)])
+def test_a_run_says_how_far_a_long_fit_is(run, monkeypatch, plugin, silence, shown):
+    plugin("slow", SLOW)
+    monkeypatch.setattr(display, "SILENCE", silence)
+    code, out, _ = run(*CLOCK, "--detector", "slow")
     assert code == 0
-    assert re.search(r"^slow on cartpole: fitting 40 %, \d+ s$", out, re.MULTILINE)
-    assert "slow on cartpole" not in run(*slow, "-q")[1]
+    told = re.search(r"^slow on cartpole: fitting 40 %, \d+ s$", out, re.MULTILINE)
+    assert bool(told) == shown
 
 
-def test_on_a_terminal_what_runs_stands_below_a_bar(run, monkeypatch, tmp_path_factory):
-    install(monkeypatch, tmp_path_factory.mktemp("plugin"), "slow", SLOW)
+def test_on_a_terminal_what_runs_stands_below_a_bar(run, monkeypatch, plugin):
+    plugin("slow", SLOW)
     screen = Console(file=io.StringIO(), force_terminal=True, width=80, markup=False)
     monkeypatch.setattr(run_module, "make_console", lambda **_: screen)
-    assert run(*CLOCK, "--detector", "slow", "--seed", "0,1")[0] == 0
+    assert run(*CLOCK, "--detector", "slow")[0] == 0
     text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", screen.file.getvalue())
-    assert re.search(r"0/16 cells, 0:00:\d\d so far", text)
+    assert re.search(r"0/8 cells, 0:00:\d\d so far", text)
     assert re.search(r"slow\[h=1,seed=0\] on cartpole: fitting 40 %, \d+ s", text)
 
 
@@ -219,16 +202,18 @@ def test_the_time_left_is_from_cells_of_this_run_alone():
     assert str(display.Pace(16, time.perf_counter(), done=8)) == "8/16 cells, 0:00:00 so far"
 
 
-def test_detectors_without_a_library_come_first_and_records_keep_their_order(run, tmp_path):
-    code, out, _ = run(*CLOCK, "--detector", "rf,clock")
+def test_detectors_without_a_library_come_first_and_records_keep_their_order(run, plugin, tmp_path):
+    heavy = 'DetectorSpec("heavy", Good, "", requires=("numpy",))'
+    plugin("heavy", f"@hookimpl\ndef oodd_detectors(): return [{heavy}]")
+    code, out, _ = run(*CLOCK, "--detector", "heavy,clock")
     assert code == 0
-    assert out.index("ok           cartpole/clock") < out.index("ok           cartpole/rf")
+    assert out.index("ok           cartpole/clock") < out.index("ok           cartpole/heavy")
     lines = (tmp_path / "oodd-results" / "records.jsonl").read_text().splitlines()
-    assert ['"detector": "rf"' in line for line in lines] == [True] * 8 + [False] * 8
+    assert ['"detector": "heavy"' in line for line in lines] == [True] * 8 + [False] * 8
 
 
-def test_a_broken_plugin_is_named_and_makes_exit_code_1(run, monkeypatch, tmp_path_factory):
-    install(monkeypatch, tmp_path_factory.mktemp("plugin"), "bad", "import no_such")
+def test_a_broken_plugin_is_named_and_makes_exit_code_1(run, plugin):
+    plugin("bad", "import no_such")
     several = ("run", "--detector", "cloc*", *CLOCK[3:])
     code, out, err = run(*several)
     assert code == 1
@@ -240,23 +225,6 @@ def test_a_broken_plugin_is_named_and_makes_exit_code_1(run, monkeypatch, tmp_pa
     assert run(*several, "-p", "no:bad")[0] == 0
     # A plug-in is loaded only when its detectors may be meant.
     assert run(*CLOCK)[0] == 0
-
-
-def test_an_unavailable_detector_is_listed_with_the_command_and_fails_when_run(
-    run, monkeypatch, tmp_path_factory
-):
-    code = """
-    @hookimpl
-    def oodd_detectors():
-        return [DetectorSpec("far", Good, "", requires=("no_such",), extra="oodd-far[all]")]
-    """
-    install(monkeypatch, tmp_path_factory.mktemp("plugin"), "far", code)
-    assert (
-        '[unavailable: needs no_such: pip install "oodd-far[all]"]' in run("list", "detectors")[1]
-    )
-    code, out, _ = run("run", "--detector", "far", "--env", "cartpole", "--split", "tiny")
-    assert code == 1
-    assert "8 unavailable in" in out
 
 
 KNOWS = """
@@ -285,10 +253,8 @@ def oodd_detectors():
          ["clock[h=1,seed=0]", "small[h=1,seed=0,size=2]"]),
     ],
 )  # fmt: skip
-def test_parameters_of_one_detector_of_several(
-    run, monkeypatch, tmp_path, tmp_path_factory, arguments, rows
-):
-    install(monkeypatch, tmp_path_factory.mktemp("plugin"), "knows", KNOWS)
+def test_parameters_of_one_detector_of_several(run, plugin, tmp_path, arguments, rows):
+    plugin("knows", KNOWS)
     (tmp_path / "c.toml").write_text("[param]\nlarge.size = 9\n'small.size' = 2\n")
     first = (*CLOCK, "--detector=large,small", "--collect-only", "--anomaly=iid")
     code, out, err = run(*first, *arguments)
@@ -297,20 +263,14 @@ def test_parameters_of_one_detector_of_several(
 
 
 @pytest.mark.parametrize(
-    ("parameter", "message"),
-    [
-        ("size=7", "'size' is for all detectors, but clock has none of that name: write small"),
-        ("smal.size=7", "unknown detector 'smal': did you mean 'small'"),
-        ("small.sise=7", "did you mean 'size'"),
-    ],
+    ("parameter", "near"),
+    [("size=7", "small"), ("smal.size=7", "'small'"), ("small.sise=7", "'size'")],
 )
-def test_a_parameter_that_not_all_detectors_have_is_refused(
-    run, monkeypatch, tmp_path_factory, parameter, message
-):
-    install(monkeypatch, tmp_path_factory.mktemp("plugin"), "knows", KNOWS)
+def test_a_parameter_that_not_all_detectors_have_is_refused(run, plugin, parameter, near):
+    plugin("knows", KNOWS)
     code, _, err = run(*CLOCK, "--detector=clock,small", "--param", parameter)
     assert code == 4
-    assert message in err
+    assert near in err
 
 
 def test_options_come_from_a_file_and_the_command_line_wins(run, tmp_path, failing):
@@ -332,12 +292,10 @@ def test_options_come_from_a_file_and_the_command_line_wins(run, tmp_path, faili
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["data", "bild"], "unknown command of data 'bild': did you mean 'build'?"),
         (["list", "detector"], "unknown thing to list 'detector': did you mean 'detectors'?"),
         (["data"], "(see oodd-eval data --help)"),
         ([*CLOCK, "--detectr", "x"], "'--detector'"),
         (["run", "--env", "cartpole"], "'--detector' (see oodd-eval run --help)"),
-        (["leaderboard", "submit", "x", "--primary"], "--primary"),
         ([*CLOCK, "--env", "cartpol"], "'cartpol': did you mean 'cartpole'?"),
         ([*CLOCK, "--split", "tny"], "unknown split 'tny': did you mean 'tiny'?"),
         ([*CLOCK, "--param", "size=1"], "unknown parameter of clock 'size'"),
@@ -351,10 +309,6 @@ def test_options_come_from_a_file_and_the_command_line_wins(run, tmp_path, faili
         ([*CLOCK, "--config", "nowhere.toml"], "'nowhere.toml' cannot be read"),
         ([*CLOCK, "--output", "file/out"], "cannot be written to"),
         (["show", "nowhere", "--metric", "acc"], "unknown metric 'acc': did you mean 'auc'?"),
-        (["data", "build", "mini", "--train", "3"], "is published: --train would make another"),
-        (["data", "build", "dev"], "--train, --calibration, --test, --seed-base must be given"),
-        (["policies", "train", "antt"], "unknown environment 'antt': did you mean 'ant'?"),
-        (["policies", "evaluate", "ant", "--episodes", "0"], "'--episodes'"),
     ],
 )
 def test_a_wrong_request_is_exit_code_4_with_one_message(run, tmp_path, arguments, message):
@@ -437,54 +391,34 @@ def test_show_finds_a_split_that_was_named_by_its_path(run, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("arguments", "options"),
     [
-        ("show --metric auc", "--metric is of the table of one detector: name it with --detector"),
-        ("show --csv --json", "--json and --csv|--csv and --json"),
-        ("show --stored --split tiny", "--split is for computing"),
-        ("show --stored --row-metrics", "--row-metrics is for computing"),
-        ("show --row-metrics", "--row-metrics is for splits without twins"),
-        ("show --wide --markdown", "--wide is for the terminal"),
-        ("show --wide --detector clock", "--wide prints tables of all detectors"),
-        ("show --csv --detector clock --metric auc", "--metric is of a table"),
-        ("show --csv --level 10", "--level is of tables, and that format has all levels"),
-        ("show --markdown --paper", "--paper is for the terminal"),
-        ("show --detector clock --paper", "--paper prints tables of all detectors"),
-        ("compare --metric auc --against oodd-results", "--metric is for the comparison of two"),
-        ("compare clock range --fail auc:-1", "--fail is for a comparison with --against"),
-        ("compare --write-reference x --two-sided", "--two-sided is for a comparison: say with"),
-        ("compare --against oodd-results --keep auc", "--keep is for a reference"),
+        ("show --metric auc", "--metric"),
+        ("show --csv --json", "--json --csv"),
+        ("show --stored --split tiny", "--split"),
+        ("show --stored --row-metrics", "--row-metrics"),
+        ("show --row-metrics", "--row-metrics"),
+        ("show --wide --markdown", "--wide"),
+        ("show --wide --detector clock", "--wide"),
+        ("show --csv --detector clock --metric auc", "--metric"),
+        ("show --csv --level 10", "--level"),
+        ("show --markdown --paper", "--paper"),
+        ("show --detector clock --paper", "--paper"),
+        ("compare --metric auc --against oodd-results", "--metric"),
+        ("compare clock range --fail auc:-1", "--fail"),
+        ("compare --write-reference x --two-sided", "--two-sided"),
+        ("compare --against oodd-results --keep auc", "--keep"),
+        ("run --detector clock --env all --split tiny --row-metrics", "--row-metrics"),
     ],
 )
-def test_options_that_would_do_nothing_are_refused(run, clock, arguments, message):
-    command, _, options = arguments.partition(" ")
+def test_options_that_would_do_nothing_are_refused(run, clock, arguments, options):
+    command, *others = arguments.split()
+    results = [] if command == "run" else ["oodd-results"]
     shutil.copytree(clock, "oodd-results")
-    code, out, err = run(command, "oodd-results", *options.split())
+    code, out, err = run(command, *results, *others)
     assert (code, out) == (4, "")
-    assert any(text in err for text in message.split("|")), err
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("check clock --env hopper", "--env is for anomalies, and clock is a detector"),
-        ("scan logs --watchdog x --jobs 2", "--jobs is for fits, and --watchdog judges without"),
-        ("scan logs --recipe x.toml --format csv", "--format is said by the recipe"),
-        ("reproduce --render-only --budget 2h", "--budget is for a run, and --render-only runs"),
-        ("run --detector clock --env all --split tiny --row-metrics", "splits without twins"),
-    ],
-)
-def test_options_that_would_do_nothing_are_refused_elsewhere(run, arguments, message):
-    code, out, err = run(*arguments.split())
-    assert (code, out) == (4, "")
-    assert message in err
-
-
-def test_data_of_one_detector(run):
-    run(*CLOCK, "--detector", "clock,range")
-    lines = run("show", "oodd-results", "--csv", "--detector", "range")[1].splitlines()
-    assert len(lines) == 1 + 8
-    assert not any(",clock," in line for line in lines)
+    assert all(option in err for option in options.split()), err
+    assert err.count("\n") == 1
 
 
 def test_show_recomputes_metrics_from_scores(run, clock, tmp_path):
@@ -499,6 +433,9 @@ def test_show_recomputes_metrics_from_scores(run, clock, tmp_path):
 
 def test_two_rows_of_one_run_are_compared(run):
     run("run", "--detector", "clock,range", "--env", "all", "--split", "tiny")
+    lines = run("show", "oodd-results", "--csv", "--detector", "range")[1].splitlines()
+    assert len(lines) == 1 + 16
+    assert not any(",clock," in line for line in lines)
     code, out, _ = run("compare", "oodd-results", "range", "clock")
     assert code == 0
     assert re.search(r"matched AUC: range \S+ %, clock 50.0 %, .*16 cells", out)
@@ -542,27 +479,6 @@ def test_verify_tells_sound_data_from_changed_data(run, tiny_split, tmp_path):
     assert "does not match the manifest" in err
 
 
-@pytest.mark.parametrize(
-    ("missing", "arguments", "extra"),
-    [
-        ("gymnasium", BUILD, "gym"),
-        ("pybullet", ["policies", "evaluate", "hopper"], "bullet"),
-        ("torch", ["policies", "train", "hopper"], "train"),
-    ],
-)
-def test_a_missing_extra_is_named_with_the_command(tmp_path, missing, arguments, extra):
-    # Worker processes must not find it either.
-    (tmp_path / "first").mkdir()
-    (tmp_path / "first" / f"{missing}.py").write_text("raise ImportError('none here')\n")
-    done = subprocess.run(
-        [sys.executable, "-m", "oodd_eval", *arguments], cwd=tmp_path, capture_output=True,
-        text=True, check=False,
-        env={**os.environ, "OODD_EVAL_DATA": str(tmp_path), "PYTHONPATH": str(tmp_path / "first")},
-    )  # fmt: skip
-    assert done.returncode == 4, done.stderr
-    assert f"pip install 'oodd-eval[{extra}]'" in done.stderr
-
-
 def test_help_is_short_and_says_what_to_do_first(capsys):
     assert cli.main([]) == 0
     out = capsys.readouterr().out
@@ -576,111 +492,68 @@ def test_help_is_short_and_says_what_to_do_first(capsys):
     assert re.fullmatch(r"oodd-eval \d+\.\d+\.\d+\S*\n", capsys.readouterr().out)
 
 
-def commands(rows, *names):
-    """The words of every command of a table."""
-    for name, (_, target) in rows.items():
-        yield from [[*names, name]] if isinstance(target, str) else commands(target, *names, name)
-
-
-def test_help_of_a_group_needs_no_extra_of_its_commands(capsys, monkeypatch):
-    def import_all_but_recording(target, load=cli_package.load):
-        if target.startswith("oodd_recording"):
-            raise MissingExtraError("recording needs the simulators")
-        return load(target)
-
-    monkeypatch.setattr(cli_package, "load", import_all_but_recording)
-    assert cli.main(["leaderboard", "--help"]) == 0
-    text = capsys.readouterr().out
-    assert "  rerun " in text
-    assert "oodd-eval leaderboard verify" in text.partition("\nExamples:\n")[2]
-
-
-@pytest.mark.parametrize(
-    "words", [w for rows in cli.COMMANDS.values() for w in commands(rows)], ids=" ".join
-)
-def test_every_command_has_help_with_examples_that_can_be_parsed(capsys, words):
-    assert cli.main([*words, "--help"]) == 0
-    text = capsys.readouterr().out
-    assert text.startswith(f"Usage: oodd-eval {' '.join(words)} ")
-    examples = re.findall(r"^  (oodd-eval .*)$", text.partition("\nExamples:\n")[2], re.MULTILINE)
-    assert examples
-    for example in examples:
-        assert parse(example).command == words[-1]
-
-
 @pytest.mark.parametrize(
     ("words", "completions"),
     [
-        (["sh"], {"show"}),
-        (["data", "ver"], {"verify"}),
-        (["list", "en"], {"envs"}),
-        (["run", "--det"], {"--detector"}),
-        (["run", "--detector", "mewma,clo"], {"mewma,clock"}),
-        (["run", "--env", "wal"], {"walker2d"}),
-        (["run", "--config", "nowhere.toml", "--anomaly", "gravity,wind-l"], {"gravity,wind-l2r"}),
-        (["data", "info", "noisy"], {"noisy-1", "noisy-5"}),
-        (["show", "oodd-results", "--metric", "found_within_20_at_5"], {"found_within_20_at_5pct"}),
-        (["info", "hop"], {"hopper"}),
-        (["nonsense", "x"], set()),
+        ("sh", {"show"}),
+        ("data ver", {"verify"}),
+        ("list en", {"envs"}),
+        ("run --det", {"--detector"}),
+        ("run --detector mewma,clo", {"mewma,clock"}),
+        ("run --env wal", {"walker2d"}),
+        ("run --config nowhere.toml --anomaly gravity,wind-l", {"gravity,wind-l2r"}),
+        ("data info noisy", {"noisy-1", "noisy-5"}),
+        ("show oodd-results --metric found_within_20_at_5", {"found_within_20_at_5pct"}),
+        ("info hop", {"hopper"}),
+        ("nonsense x", set()),
     ],
 )
 def test_names_are_completed(words, completions):
-    environment = {"COMP_WORDS": shlex.join(["oodd-eval", *words]), "COMP_CWORD": str(len(words))}
-    done = subprocess.run(
-        [sys.executable, "-m", "oodd_eval"], capture_output=True, text=True, check=True,
-        env=os.environ | environment | {"_OODD_EVAL_COMPLETE": "bash_complete"},
-    )  # fmt: skip
-    assert {line.partition(",")[2] for line in done.stdout.splitlines()} == completions
-    assert done.stderr == ""
+    *before, incomplete = words.split()
+    shell = ShellComplete(cli.PROGRAM, {}, "oodd-eval", cli.COMPLETION)
+    with contextlib.suppress(UnknownNameError):  # as `main` does
+        assert {i.value for i in shell.get_completions(before, incomplete)} == completions
+        return
+    assert not completions
 
 
-@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_a_shell_completes_by_the_printed_script(shell):
+def test_a_shell_completes_by_the_printed_script(capsys):
     path = f"{Path(sys.executable).parent}:{os.defpath}"
-    script = subprocess.run(
-        ["oodd-eval", "completion", shell], capture_output=True, check=True, env={"PATH": path}
-    ).stdout.decode()
-    assert "_OODD_EVAL_COMPLETE" in script
-    if shell == "bash":
-        program = (
-            f"{script}\nCOMP_WORDS=(oodd-eval lea); COMP_CWORD=1; _oodd_eval_completion oodd-eval\n"
-            "echo ${COMPREPLY[@]}"
-        )
-        done = subprocess.run(["bash", "-c", program], env={"PATH": path}, stdout=-1, check=True)
-        assert done.stdout == b"leaderboard\n"
+    for shell in ("zsh", "fish", "bash"):
+        assert cli.main(["completion", shell]) == 0
+        script = capsys.readouterr().out
+        assert cli.COMPLETION in script
+    program = (
+        f"{script}\nCOMP_WORDS=(oodd-eval lea); COMP_CWORD=1; _oodd_eval_completion oodd-eval\n"
+        "echo ${COMPREPLY[@]}"
+    )
+    done = subprocess.run(["bash", "-c", program], env={"PATH": path}, stdout=-1, check=True)
+    assert done.stdout == b"leaderboard\n"
 
 
-def test_info_describes_detectors_environments_and_anomalies(run):
-    code, out, _ = run("info", "rf")
+@pytest.mark.parametrize(
+    ("name", "facts"),
+    [
+        ("rf", [r"^detector +rf, oodd-eval ", r"trees = \d+  "]),
+        ("hopper", ["15 sensors", r"torso height above its start \(m\)"]),
+        ("gravity", [r"^group +dynamics$"]),
+        ("standard", [r"^trajectories +500 train, 200 calibration, 50 test seeds$",
+                      "not here: oodd-eval data build standard"]),
+        ("missed_at_5pct", [r"^better side +lower is better$", "in at most 5 % of nominal"]),
+    ],
+)  # fmt: skip
+def test_info_describes_whatever_has_a_name(run, name, facts):
+    code, out, _ = run("info", name)
     assert code == 0
-    assert re.search(r"^detector +rf, oodd-eval ", out)
-    assert re.search(r"trees = \d+  ", out)
-    code, out, _ = run("info", "hopper")
-    assert "15 sensors" in out
-    assert "torso height above its start (m)" in out
-    code, out, _ = run("info", "gravity")
-    assert re.search(r"^group +dynamics$", out, re.MULTILINE)
-    code, _, err = run("info", "gravty")
-    assert code == 4
-    assert "did you mean 'gravity'" in err
-    assert "did you mean" not in run("info", "nonsense")[2]
+    assert all(re.search(fact, out, re.MULTILINE) for fact in facts)
 
 
-def test_info_describes_splits_and_metrics(run):
+def test_info_of_a_split_is_its_description_and_near_names_are_offered(run):
     code, out, _ = run("info", "tiny")
     assert (code, out) == run("data", "info", "tiny")[:2]
     assert out.startswith("split tiny, digest ")
-    code, out, _ = run("info", "standard")
-    assert code == 0
-    assert re.search(
-        r"^trajectories +500 train, 200 calibration, 50 test seeds$", out, re.MULTILINE
-    )
-    assert "not here: oodd-eval data build standard" in out
-    code, out, _ = run("info", "missed_at_5pct")
-    assert code == 0
-    assert re.search(r"^better side +lower is better$", out, re.MULTILINE)
-    assert re.search(r"^alarms +guaranteed, in at most 5 % of nominal", out, re.MULTILINE)
-    for name, near in (("auc_mached", "auc_matched"), ("tinny", "tiny"), ("standrad", "standard")):
+    near = {"gravty": "gravity", "auc_mached": "auc_matched", "tinny": "tiny", "nonsense": ""}
+    for name, offered in near.items():
         code, _, err = run("info", name)
         assert code == 4
-        assert f"did you mean '{near}'" in err
+        assert (f"did you mean '{offered}'" in err) == bool(offered)
