@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from oodd_eval import Trajectory
 from oodd_eval.data.facts import LogFacts, Quantity
 from oodd_eval.data.layout import own_facts, write_environment, write_manifest
 
@@ -33,6 +34,14 @@ def log_episode(seed, rows=60, intervals=(), task="", *, sensors=3, shift=3.0):
     for start, stop in intervals:
         states[max(start, 0) : stop, -1] += shift
     return LogEpisode(states, tuple(intervals), task, f"log{seed}")
+
+
+def nominal_episodes(seeds, *, drift=0.0, rows=60):
+    """Nominal episodes whose second sensor rises from each to the next."""
+    return [
+        Trajectory(log_episode(seed, rows).observations + np.array([0, drift * k, 0]))
+        for k, seed in enumerate(seeds)
+    ]
 
 
 def log_arrays(episodes, *, labelled, sensors=3, actions=1):

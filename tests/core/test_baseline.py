@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from helpers_logs import UNPAIRED, log_episode, make_log_split, write_log_split
 from helpers_plugins import install
-from oodd_live import Watchdog
 
 from oodd_eval import DetectorSpec, Trajectory, load_split
 from oodd_eval.data.baseline import Baseline
@@ -33,13 +32,6 @@ class Remembers:
     def score(self, x):
         type(self).shown = x.observations.copy()
         return np.abs(x.observations).sum(axis=1).astype(np.float64)
-
-
-def nominal():
-    """Training and calibration episodes."""
-    return (
-        [Trajectory(log_episode(k).observations) for k in r] for r in (range(40), range(100, 138))
-    )
 
 
 def scored(split, factory, detector="mine", **changes):
@@ -176,61 +168,3 @@ def test_fits_with_and_without_baseline_rows_are_different_ones(tmp_path):
         plan = make_plan(plugins, split=split, detectors=["mewma"], environments=["arm"])
         keys.add(plan.units[0].fit_key)
     assert len(keys) == 2
-
-
-@pytest.mark.parametrize("name", ["mewma", "mahalanobis", "persistence"])
-def test_a_watchdog_streams_what_a_run_scores_bit_for_bit(tmp_path, name):
-    split = load_split(make_log_split(tmp_path / "arm", FACTS, calibration=38, train=12))
-    with split.opened() as opened:
-        data = opened("arm")
-        watchdog = Watchdog.fit(name, data)
-        base = Baseline.fit(data.train, B)
-        detector = discover().offer(name).spec.factory(seed=0, horizon=1)
-        detector.fit([base.judged(x).without_actions() for x in data.train])
-        for x in (data.twins[0], data.labelled("slip")[0]):
-            batch = detector.score(base.judged(x).without_actions())
-            watchdog.reset()
-            actions = [None, *x.actions]
-            readings = [watchdog.update(o, a) for o, a in zip(x.observations, actions, strict=True)]
-            scores = np.array([reading.score for reading in readings])
-            assert np.isnan(scores[:B]).all()
-            assert not any(reading.alarm for reading in readings[:B])
-            np.testing.assert_array_equal(scores[B:], batch)
-
-
-def test_a_saved_watchdog_keeps_its_baseline(tmp_path):
-    train, calibration = nominal()
-    watchdog = Watchdog.fit("mewma", train, calibration, baseline=B)
-    watchdog.save(tmp_path / "kept")
-    other = Watchdog.load(tmp_path / "kept")
-    for row in log_episode(7, intervals=[(30, 50)]).observations:
-        assert watchdog.update(row) == other.update(row)
-
-
-def test_a_watchdog_learns_the_machine_it_is_beside():
-    """A shift of the whole episode is no alarm with baseline rows, and one without."""
-    train, calibration = nominal()
-    alarms = {}
-    for rows in (0, B):
-        watchdog = Watchdog.fit("mahalanobis", train, calibration, baseline=rows)
-        shifted = log_episode(300).observations + 5.0
-        alarms[rows] = [watchdog.update(row).alarm for row in shifted]
-    assert any(alarms[0])
-    assert not any(alarms[B])
-    watchdog.reset()
-    later = log_episode(300).observations + 5.0
-    later[40:] += 5.0
-    readings = [watchdog.update(row) for row in later]
-    first = next(reading for reading in readings if reading.alarm)
-    assert 40 <= first.t <= 50
-
-
-def test_faults_are_watched_while_baseline_rows_are_gathered():
-    train, calibration = nominal()
-    watchdog = Watchdog.fit("mahalanobis", train, calibration, baseline=B)
-    rows = log_episode(300).observations
-    rows[5:, 1] = np.nan
-    readings = [watchdog.update(row) for row in rows[:B]]
-    assert readings[-1].faults == {"sensor 1": "missing"}
-    assert readings[-1].alarm
-    assert np.isnan(readings[-1].score)

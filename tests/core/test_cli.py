@@ -327,6 +327,8 @@ def test_an_unforeseen_error_is_exit_code_3_with_a_traceback(run, monkeypatch):
     assert code == 3
     assert "ZeroDivisionError" in err
     assert "internal error" in err
+    # Of a request that is refused there is one with -v alone.
+    assert "Traceback" in run(*CLOCK, "-v", "--env", "nowhere")[2]
 
 
 def test_a_reader_that_leaves_ends_the_run_quietly(tiny_split, tmp_path):

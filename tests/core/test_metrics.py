@@ -108,6 +108,14 @@ def test_unpaired_compares_with_the_next_twin_where_both_are():
     assert found["auc_unpaired"].numerator.tolist() == [2 / 3, 1, 0.5]
 
 
+def test_an_anomalous_episode_that_ends_first_ends_the_comparison_of_its_twins():
+    twins = arrays([0, 1, 1, 5], [0, 0, 2, 9])
+    found = auc_contributions(arrays([0, 2, 2], [0, 1, 1, 1]), twins, [1, 1])
+    # Rows 1 and 2: 2, 2 against 0, 2; and 1, 1 against 0, 2. Row 3 would make both lower.
+    assert found["auc_unpaired"].numerator[0] == 3 / 4
+    assert found["auc_placebo"].numerator[0] == 2 / 4
+
+
 def test_unpaired_loses_what_accumulated_noise_of_the_twin_gives_away():
     """A random walk shared until the effect: a small step is seen beside the own twin only."""
     rng = np.random.default_rng(8)

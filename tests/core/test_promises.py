@@ -6,8 +6,14 @@ import math
 
 import numpy as np
 import pytest
-from helpers_logs import UNPAIRED, log_episode, log_parts, make_log_split, write_log_split
-from oodd_live import Watchdog
+from helpers_logs import (
+    UNPAIRED,
+    log_episode,
+    log_parts,
+    make_log_split,
+    nominal_episodes,
+    write_log_split,
+)
 from scipy.stats import binom, spearmanr
 
 from oodd_eval import Trajectory, evaluate, load_results, load_split
@@ -24,7 +30,6 @@ from oodd_eval.metrics.alarms import (
     quantile_rank,
     rolling_rules,
 )
-from oodd_eval.metrics.auc import auc
 from oodd_eval.metrics.drift import drift_test, permutation_test, two_sample_test
 from oodd_eval.metrics.promise import EpisodeMeans, achieved_share, enough_episodes
 from oodd_eval.plugins.contract import make_detector
@@ -33,15 +38,6 @@ from oodd_eval.results.evaluate import rescore
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
 from oodd_eval.scoring.promises import promises_of
-
-
-def episodes(seeds, *, drift=0.0, rows=60):
-    """Nominal episodes whose second sensor rises from each to the next."""
-    return [
-        Trajectory(log_episode(seed, rows).observations + np.array([0, drift * k, 0]))
-        for k, seed in enumerate(seeds)
-    ]
-
 
 # -- thresholds -----------------------------------------------------------------------------------
 
@@ -137,9 +133,11 @@ def test_p_values_of_exchangeable_episodes_are_uniform():
 
 def test_all_orders_of_a_few_episodes_agree_with_the_drawn_ones():
     values = np.array([[1.0], [2.0], [3.0], [5.0], [4.0], [6.0], [7.0]])
-    orders = [abs(spearmanr(values[:, 0], o).statistic) for o in itertools.permutations(range(7))]
+    orders = np.array([*itertools.permutations(range(7))]) - 3
+    # Ranks without ties: their variance is 4.
+    correlations = np.abs(orders @ (np.argsort(values[:, 0]) - 3)) / (7 * 4)
     test = drift_test(values)
-    exact = np.mean(np.array(orders) >= test.statistic - 1e-12)
+    exact = np.mean(correlations >= test.statistic - 1e-12)
     assert test.p == pytest.approx(exact, abs=0.004)
 
 
@@ -149,9 +147,7 @@ def test_all_orders_of_a_few_episodes_agree_with_the_drawn_ones():
 def test_what_does_not_vary_does_not_drift(values):
     assert drift_test(values) == permutation_test(values, np.arange(len(values), dtype=float))
     assert (drift_test(values).p, drift_test(values).column) == (1.0, -1)
-
-
-def test_a_few_episodes_are_not_remarkable_in_any_order():
+    # Nor are five episodes remarkable in any order.
     assert drift_test(np.arange(5.0)[:, None]).p == 1.0
     assert drift_test(np.arange(9.0)[:, None]).p == 0.001
 
@@ -200,38 +196,41 @@ def subjects(findings):
 
 
 def test_a_drift_is_named_with_its_sensor():
-    train, calibration = episodes(range(20), drift=0.1), episodes(range(100, 140))
+    train, calibration = nominal_episodes(range(20), drift=0.1), nominal_episodes(range(100, 140))
     calibration = [Trajectory(x.observations + np.float32([0, 2, 0])) for x in calibration]
     found = subjects(promises(train, calibration, sensors=["a", "b", "c"]))
     assert found["drift"].doubt
     assert found["drift"].sensor == "b"
     assert "the mean of b follows the order of all 60" in found["drift"].text
     assert found["drift"].p == 0.001
-    quiet = subjects(promises(episodes(range(20)), episodes(range(100, 140))))
+    quiet = subjects(promises(nominal_episodes(range(20)), nominal_episodes(range(100, 140))))
     assert not quiet["drift"].doubt
     assert "drift" not in subjects(promises(train, calibration, recorded=False))
 
 
 def test_with_baseline_rows_only_what_is_left_of_a_drift_counts():
-    drifting = episodes(range(60), drift=0.1)
+    drifting = nominal_episodes(range(60), drift=0.1)
     assert subjects(promises(drifting[:20], drifting[20:]))["drift"].doubt
     assert not subjects(promises(drifting[:20], drifting[20:], baseline=20))["drift"].doubt
 
 
 def test_calibration_that_is_unlike_or_shorter_is_said():
-    train, calibration = episodes(range(20)), episodes(range(100, 140))
-    alike = subjects(promises(train, calibration, episodes(range(200, 220))))
+    train, calibration = nominal_episodes(range(20)), nominal_episodes(range(100, 140))
+    alike = subjects(promises(train, calibration, nominal_episodes(range(200, 220))))
     assert not alike["difference"].doubt
     assert not alike["length"].doubt
     assert "no drift seen in 80 nominal episodes" in alike["drift"].text
-    moved = [Trajectory(x.observations + np.float32([0, 0, 2])) for x in episodes(range(200, 220))]
+    moved = [
+        Trajectory(x.observations + np.float32([0, 0, 2]))
+        for x in nominal_episodes(range(200, 220))
+    ]
     other = subjects(promises(train, calibration, moved))
     assert other["difference"].doubt
     assert other["difference"].sensor == "sensor 2"
-    longer = subjects(promises(train, calibration, episodes(range(200, 220), rows=90)))
+    longer = subjects(promises(train, calibration, nominal_episodes(range(200, 220), rows=90)))
     assert longer["length"].doubt
     assert "60 rows in the median, nominal test episodes 90" in longer["length"].text
-    shorter = subjects(promises(train, calibration, episodes(range(200, 220), rows=30)))
+    shorter = subjects(promises(train, calibration, nominal_episodes(range(200, 220), rows=30)))
     assert not shorter["length"].doubt
 
 
@@ -271,158 +270,12 @@ def test_the_chance_of_so_many_later_alarms_is_that_of_random_orders():
     assert finding.p == pytest.approx(share, abs=0.02)
 
 
-# -- the watchdog ---------------------------------------------------------------------------------
-
-
-def test_a_watchdog_warns_of_drift_and_keeps_the_note():
-    drifting = episodes(range(78), drift=0.02)
-    with pytest.warns(PromiseWarning, match="the mean of sensor 1 follows the order"):
-        watchdog = Watchdog.fit("mahalanobis", drifting[:40], drifting[40:], 0.10)
-    assert any("drift" in note for note in watchdog.notes)
-
-
-def test_confirmed_episodes_join_the_calibration(tmp_path):
-    train, calibration = episodes(range(40)), episodes(range(100, 140))
-    watchdog = Watchdog.fit("mahalanobis", train, calibration, 0.10)
-    first = watchdog.calibration
-    for k, x in enumerate(episodes(range(300, 306))):
-        for row in x.observations:
-            watchdog.update(row)
-        largest = first.unbounded.largest(watchdog._handle.detector.score(x))
-        watchdog.confirm()
-        assert watchdog.calibration.largest[-1] == pytest.approx(largest)
-        assert len(watchdog.calibration.largest) == len(first.largest) + k + 1
-        assert watchdog.calibration.standardization == first.standardization
-        assert watchdog.rule == watchdog.calibration.rule(0.10)
-        assert watchdog.raised is None
-    watchdog.save(tmp_path / "kept")
-    other = Watchdog.load(tmp_path / "kept")
-    assert other.calibration == watchdog.calibration
-    for one in (watchdog, other):
-        for row in log_episode(7).observations:
-            reading = one.update(row)
-        one.confirm()
-        assert reading.threshold != one.rule.threshold or one.rule == watchdog.rule
-    assert other.calibration == watchdog.calibration
-
-
-def test_an_acknowledged_alarm_and_a_fault_count_when_an_episode_is_confirmed():
-    train, calibration = episodes(range(40)), episodes(range(100, 140))
-    watchdog = Watchdog.fit("mahalanobis", train, calibration, 0.20)
-    x = Trajectory(log_episode(7, intervals=[(30, 50)], shift=0.7).observations)
-    for row in x.observations:
-        if watchdog.update(row).alarm:
-            watchdog.acknowledge()
-    whole = watchdog.calibration.unbounded.largest(watchdog._handle.detector.score(x))
-    watchdog.confirm()
-    assert watchdog.calibration.largest[-1] == pytest.approx(whole)
-    for _ in range(10):
-        watchdog.update(None)
-    watchdog.confirm()
-    assert math.isinf(watchdog.calibration.largest[-1])
-
-
-def test_what_cannot_join_is_refused_and_changes_nothing():
-    train, calibration = episodes(range(40)), episodes(range(100, 140))
-    watchdog = Watchdog.fit("mahalanobis", train, calibration, 0.05)
-    with pytest.raises(UsageError, match="0 rows since the last reset"):
-        watchdog.confirm()
-    before = watchdog.calibration, watchdog.rule
-    watchdog.update(np.zeros(3))
-    with pytest.raises(UsageError, match="takes 59, got 21"):
-        watchdog.confirm()
-    assert (watchdog.calibration, watchdog.rule) == before
-    for arguments in ({"confidence": 0.5, "alpha": 0.1}, {"hours": 1, "rate": 50}):
-        other = Watchdog.fit("mahalanobis", train, calibration, **arguments)
-        other.update(np.zeros(3))
-        with pytest.raises(UsageError, match="fit it with alpha alone"):
-            other.confirm()
-
-
-# -- offsets: a northing of 5.4e6 m ---------------------------------------------------------------
-
-
-NORTHING = np.array([5.4e6, 0.0, 0.0])
-
-
-def positions(seed, *, far, slip=()):
-    """A vehicle near its mark; the slip is a fifth of a metre in the northing."""
-    rows = log_episode(seed, 60).observations
-    for start, stop in slip:
-        rows[start:stop, 0] += 0.5 * np.arange(stop - start)
-    return rows + (NORTHING if far else 0.0)
-
-
-def test_a_watchdog_of_float64_rows_is_as_without_the_offset():
-    found, areas = {}, {}
-    for far in (False, True):
-        train, calibration = (
-            [positions(k, far=far) for k in part] for part in (range(40), range(100, 138))
-        )
-        watchdog = Watchdog.fit("mahalanobis", train, calibration, 0.10)
-        assert bool(watchdog._nominal.offsets[0]) == far
-        assert not watchdog._nominal.offsets[1:].any()
-        found[far], areas[far] = [], []
-        for k in range(20):
-            watchdog.reset()
-            rows = positions(500 + k, far=far, slip=[(30, 50)])
-            readings = [watchdog.update(row) for row in rows]
-            found[far].append(next((r.t for r in readings if r.alarm and r.t >= 30), None))
-            scores = np.array([reading.score for reading in readings])
-            areas[far].append(auc(scores[30:50], scores[:30]))
-    assert found[True] == found[False]
-    assert sum(t is not None for t in found[True]) == 20
-    assert np.mean(areas[True]) == pytest.approx(np.mean(areas[False]), abs=0.002)
-    assert np.mean(areas[True]) > 0.8
-
-
-def test_a_split_gives_its_offsets_to_the_watchdog(tmp_path):
-    facts = dataclasses.replace(UNPAIRED, offsets=(5.4e6, 0.0, 0.0), rate=10.0)
-    split = load_split(make_log_split(tmp_path / "arm", facts, train=40, calibration=38))
-    with split.opened() as opened:
-        data = opened("arm")
-        watchdog = Watchdog.fit("mahalanobis", data, alpha=0.10)
-        plain = Watchdog.fit("mahalanobis", data.train, data.calibration, 0.10)
-        assert watchdog.rule == plain.rule
-        assert watchdog.sensors == [quantity.name for quantity in data.sensors]
-        assert watchdog.settings.rate == 10.0
-        watchdog.save(tmp_path / "kept")
-        other = Watchdog.load(tmp_path / "kept")
-        for row in data.twins[0].observations:
-            near = plain.update(row).score
-            raw = row.astype(np.float64) + NORTHING
-            far = watchdog.update(raw).score
-            assert far == pytest.approx(near, rel=1e-6)
-            assert other.update(dict(zip(watchdog.sensors, raw, strict=True))).score == far
-        # Of what a split has, the offsets are subtracted already.
-        watchdog.acknowledge()
-        replayed = [reading.score for reading in watchdog.replay(data.twins[0])]
-        scored = plain.replay(data.twins[0])
-        np.testing.assert_array_equal(replayed, [reading.score for reading in scored])
-
-
 def test_offsets_are_of_what_float32_cannot_tell_and_of_nothing_else():
     rng = np.random.default_rng(0)
     rows = rng.normal(size=(50, 4)) * [0.2, 100.0, 1e-3, 0.0] + [5.4e6, 1013.0, 1.0, 7e6]
     offsets = fit_offsets([rows[:20], rows[20:]])
     assert offsets == (pytest.approx(rows[:, 0].mean()), 0.0, pytest.approx(1.0, abs=1e-2), 0.0)
     assert fit_offsets([rows[:, 1:2]]) == ()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"offsets": [1.0]}, "expected 3 numbers"),
-        ({"offsets": [1.0, math.nan, 0.0]}, "expected 3 numbers"),
-        ({"baseline": -1}, "expected a number of rows"),
-        ({"baseline": 2.5}, "expected a number of rows"),
-        ({"calibration": None}, "no calibration episodes"),
-    ],
-)
-def test_wrong_arguments_of_a_watchdog_are_told(arguments, message):
-    calibration = arguments.pop("calibration", episodes(range(100, 138)))
-    with pytest.raises(UsageError, match=message):
-        Watchdog.fit("mahalanobis", episodes(range(12)), calibration, **arguments)
 
 
 # -- machines that differ from episode to episode ------------------------------------------------
@@ -444,9 +297,7 @@ def alarm_share(name, parts, *, baseline=0, rolling=False, seed=0):
     return np.mean([r.first(scores) is not None for r, scores in zip(rules, test, strict=False)])
 
 
-@pytest.mark.parametrize(
-    "name", ["mewma", "mewma-a", "mahalanobis", "range", "persistence", "clock", "comb", "random"]
-)
+@pytest.mark.parametrize("name", ["mewma", "mahalanobis", "persistence", "comb"])
 @pytest.mark.parametrize("baseline", [0, 15])
 def test_shuffled_episodes_keep_the_promise(name, baseline):
     """In random order the mean share is at most the level, whatever the episodes are."""
@@ -563,26 +414,10 @@ def test_a_run_warns_of_drift_before_it_and_of_the_share_reached_after_it(drifti
     assert "later calibration episodes alarm" in texts[-1]
 
 
-def test_a_run_says_how_many_episodes_a_level_needs(tmp_path, capsys):
-    split = make_log_split(tmp_path / "arm", UNPAIRED, calibration=30)
-    arguments = ["run", "--detector", "clock", "--env", "all", "--split", str(split)]
-    assert main([*arguments, "--output", str(tmp_path / "out")]) == 0
-    out = " ".join(capsys.readouterr().out.split())
-    needed = "30 calibration episodes; 38 needed at 5 %, or --level 10"
-    assert out.count(f"Undefined for clock: guaranteed alarms at 5 % ({needed}).") == 1
-    split = make_log_split(tmp_path / "few", UNPAIRED, calibration=12)
-    arguments = ["run", "--detector", "clock", "--env", "all", "--split", str(split)]
-    assert main([*arguments, "--output", str(tmp_path / "few-out")]) == 0
-    out = " ".join(capsys.readouterr().out.split())
-    assert "at 5 % (12 calibration episodes; 38 needed at 5 %)." in out
-
-
 def test_the_command_prints_doubts_before_the_tables(drifting, tmp_path, capsys):
     arguments = ["run", "--detector", "clock", "--env", "all", "--split", str(drifting.path)]
-    assert main([*arguments, "--output", str(tmp_path / "out")]) == 0
+    assert main([*arguments, "--rolling", "--output", str(tmp_path / "out")]) == 0
     out = " ".join(capsys.readouterr().out.split())
     assert out.index("arm: nominal episodes drift") < out.index("ok arm/clock")
-    assert main([*arguments, "--output", str(tmp_path / "out"), "--rolling", "-q"]) == 0
-    assert len((tmp_path / "out" / "records.jsonl").read_text().splitlines()) == 2
     assert main(["data", "info", str(drifting.path)]) == 0
     assert "nominal episodes drift: the mean of q1" in " ".join(capsys.readouterr().out.split())
