@@ -3,25 +3,17 @@
 import dataclasses
 import json
 import math
-import re
-from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import pytest
-from helpers_docs import parse
 from helpers_records import PAIRED, make_record
 from hypothesis import given
 from hypothesis import strategies as st
 
-from oodd_eval import load_split
 from oodd_eval.cli import main as cli
-from oodd_eval.data.facts import ENVIRONMENTS, PROTOCOL, TABLE1
 from oodd_eval.errors import UsageError
 from oodd_eval.metrics.catalogue import NAMES
-from oodd_eval.names import expression
-from oodd_eval.results.board import Conditions
 from oodd_eval.results.compare import (
-    MEANINGS,
     NothingInCommonError,
     RecordSet,
     Tolerance,
@@ -37,7 +29,6 @@ from oodd_eval.results.render.text import markdown_section
 from oodd_eval.results.report import change, comparison_section
 
 NAN = math.nan
-ROOT = Path(__file__).parents[2]
 AUC = parse_tolerance("auc:-0.01")
 DELAY = parse_tolerance("delay:+10%")
 
@@ -305,7 +296,7 @@ def run(tmp_path, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize("reference", ["same", "same/records.jsonl", "reference.jsonl"])
-@pytest.mark.parametrize("results", ["same", "same/records.jsonl", "reference.jsonl"])
+@pytest.mark.parametrize("results", ["same", "reference.jsonl"])
 def test_identical_results_are_exit_code_0_and_one_line(run, results, reference):
     code, out, err = run(results, "--against", reference)
     assert (code, err) == (0, "")
@@ -327,17 +318,17 @@ def test_a_regression_is_exit_code_1_and_a_table(run):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("none", "--against", "same"), "no results or reference at 'none'"),
-        (("same", "--against", "none.json"), "no results or reference at 'none.json'"),
-        (("same", "--against", "same", "--fail", "ac:1"), "did you mean 'auc'"),
-        (("same", "--against", "same", "--fail", "auc:1", "--fail", "auc:2"), "two tolerances"),
-        (("same",), "nothing to do"),
-        (("same", "--against", "same", "--by", "x"), "'x'"),
-        (("same", "--against", "same", "--junit", "no/j.xml"), "'no/j.xml' cannot be written"),
+        ("none --against same", "no results or reference at 'none'"),
+        ("same --against none.json", "no results or reference at 'none.json'"),
+        ("same --against same --fail ac:1", "did you mean 'auc'"),
+        ("same --against same --fail auc:1 --fail auc:2", "two tolerances"),
+        ("same", "nothing to do"),
+        ("same --against same --by x", "'x'"),
+        ("same --against same --junit no/j.xml", "'no/j.xml' cannot be written"),
     ],
 )
 def test_what_cannot_be_done_is_exit_code_4(run, arguments, message):
-    code, _, err = run(*arguments)
+    code, _, err = run(*arguments.split())
     assert code == 4
     assert message in err
 
@@ -349,14 +340,11 @@ def test_nothing_in_common_is_exit_code_5_with_the_reason(run):
     assert run("same", "--write-reference", "r.json", "-k", "walker2d")[0] == 5
 
 
-def test_a_reference_is_written_of_the_selected_cells(run, tmp_path):
+def test_a_reference_is_written_of_the_selected_cells_and_replaced(run):
     code, out, _ = run("same", "--write-reference", "new.json", "-k", "hopper")
     assert (code, out) == (0, "2 cells written to new.json\n")
     assert run("worse", "--against", "new.json", "--fail", "auc:0.5")[0] == 0
     assert "1 new cell is not in the reference" in run("same", "--against", "new.json")[1]
-
-
-def test_a_reference_can_be_compared_with_and_then_replaced(run):
     again = ("--against", "reference.jsonl", "--fail", "auc:-0.01")
     assert run("worse", *again, "--write-reference", "reference.jsonl")[0] == 1
     assert run("worse", *again)[0] == 0
@@ -415,15 +403,13 @@ def test_junit_is_well_formed_whatever_the_names(text):
 def test_markdown_says_verdict_summary_tables_and_conditions():
     now = [record(auc=0.2), record("drift", auc=0.495)]
     text = markdown(against(now, [record(), record("drift")], AUC))
-    lines = text.splitlines()
-    assert lines[0] == "## Regression check failed: 1 of 2 figures"
-    assert "1 within, 1 worse" in lines[2]
+    assert "failed: 1 of 2 figures" in text.splitlines()[0]
     shown, folded = text.split("<details>")
     assert "| hopper/iid | auc | 0.5000 | 0.2000 | ↓ 0.3 | -0.01 | worse |" in flat(shown)
     assert "| hopper/drift | auc | 0.5000 | 0.4950 | ↓ 0.005 | -0.01 | within |" in flat(folded)
-    assert lines[-1] == "- split mini, digest abababababab, protocol 1"
+    assert "digest abababababab, protocol 1" in text.splitlines()[-1]
     same = markdown(against([record()], [record()], AUC))
-    assert same.startswith("## Regression check passed\n")
+    assert "passed" in same.splitlines()[0]
     assert "|" not in same
 
 
@@ -442,98 +428,16 @@ def test_a_failing_cell_takes_one_row_of_the_table():
     assert list(dict.fromkeys(len(row) for row in found.rows)) == [len(found.header)]
 
 
-# What stands in documents, and this project's own check
-
-DOCUMENT = (ROOT / "docs/regression-checks.md").read_text()
-CHECK = (ROOT / ".ci/run").read_text()
-
-
-def test_the_document_names_every_verdict_and_every_option_of_the_plugin():
-    assert all(re.search(rf"\b{verdict}\b", DOCUMENT) for verdict in MEANINGS)
-    source = (ROOT / "checks/oodd_checks/pytest_plugin.py").read_text()
-    options = set(re.findall(r'add\("(--oodd-[a-z-]+)"', source))
-    assert options == set(re.findall(r"^\| `(--oodd-[a-z-]+)", DOCUMENT, re.MULTILINE))
-
-
-def own_check():
-    """Parse the commands of this project's own check of its reference scores."""
-    lines = re.findall(r"step \.venv/bin/(oodd-eval .*)", CHECK)
-    return [parse(line) for line in lines]
-
-
-REFERENCES = {
-    "mini.jsonl": ("rf[h=1,seed=0]",),
-    "quick.jsonl": (
-        "npn[h=1,seed=0,members=1,updates=250]",
-        "riqn[h=1,seed=0,members=1,updates=250]",
-        "pe-a[h=1,seed=0,updates=900]",
-    ),
-}
-"""Files of reference scores, and the settings in them."""
-
-
-def reference(name):
-    return ROOT / "leaderboard/reference" / name
-
-
-@pytest.mark.parametrize("name", REFERENCES)
-def test_the_references_of_this_project_are_of_the_split_that_ships(name):
-    found = read_record_set(reference(name))
-    ((conditions, cells),) = found.boards.items()
-    assert conditions == Conditions("mini", load_split("mini").digest, PROTOCOL, None)
-    assert all(r.ok for r in found.records)
-    whole = {f"mini/{e}/{a}::{s}" for e in ENVIRONMENTS for a in TABLE1 for s in REFERENCES[name]}
-    assert whole == set(map(str, cells))
-
-
-def test_the_reference_of_whole_forests_is_of_the_committed_records(tmp_path):
-    records = read_record_set(ROOT / "leaderboard/results/paper-mini").records
-    write_reference([r for r in records if "::rf[h=1,seed=0]" in str(r.cell)], tmp_path / "r.jsonl")
-    assert reference("mini.jsonl").read_bytes() == (tmp_path / "r.jsonl").read_bytes()
-
-
-def test_the_check_of_this_project_compares_exactly_the_cells_that_it_runs():
-    """One compared and not run is missing, which fails; one run and not compared is unchecked."""
-    cells = [str(r.cell) for name in REFERENCES for r in read_record_set(reference(name)).records]
-    ran = set()
-    for options in own_check():
-        assert options.command == "run" or options.two_sided
-        if options.command == "run":
-            names = ENVIRONMENTS if options.env == "all" else options.env.split(",")
-            changed = "".join(f",{name}={value}" for name, value in options.param or ())
-            ran |= {
-                f"mini/{e}/{a}::{detector}[h=1,seed=0{changed}]"
-                for e in names
-                for a in TABLE1
-                for detector in options.detector.split(",")
-            }
-        else:
-            wanted = expression(options.expression)
-            compared = {cell for cell in cells if wanted(cell)}
-            assert compared
-            assert compared <= ran
-            ran -= compared
-    assert not ran
-
-
-def test_a_record_keeps_those_of_the_chosen_metrics_that_it_has(tmp_path):
-    """Logs with labelled rows have other metrics than those whose outcome alone is known."""
-    terms = {"far": [0.1, 0.2], "auc_rows": [0.8, 0.6]}
-    one = make_record("rf", "ant", "iid", values=terms)
-    other = make_record("rf", "ant", "drift", values={"far": terms["far"]})
-    write_reference([one, other], tmp_path / "r.jsonl", keep=[*terms])
-    kept = {r.anomaly: {*r.per_trajectory} for r in read_record_set(tmp_path / "r.jsonl").records}
-    assert kept == {"iid": {"far", "auc_rows"}, "drift": {"far"}}
-
-
 @pytest.mark.parametrize(("ending", "magic"), [("gz", b"\x1f\x8b"), ("xz", b"\xfd7zXZ")])
 def test_a_reference_keeps_the_terms_of_chosen_metrics_alone(tmp_path, ending, magic):
     values = {"auc_matched": [0.8, 0.6], "far_twin": [0.1, 0.2]}
     record = make_record("rf", "ant", "iid", values=values)
+    other = make_record("rf", "ant", "drift", values={"auc": [0.5, 0.5]})
     place = tmp_path / f"kept.jsonl.{ending}"
-    write_reference([record], place, keep=["auc_matched"])
+    # Records need not have all of them: logs with labelled rows have other metrics than outcomes.
+    write_reference([record, other], place, keep=["auc_matched", "auc_rows"])
     assert place.read_bytes().startswith(magic)
-    (kept,) = read_record_set(place).records
+    kept = next(r for r in read_record_set(place).records if r.anomaly == "iid")
     assert [*kept.metrics] == [*kept.per_trajectory] == ["auc_matched"]
     assert same_terms(kept.per_trajectory, {"auc_matched": record.per_trajectory["auc_matched"]})
     write_reference([record], tmp_path / "whole.jsonl")

@@ -17,7 +17,7 @@ from rich.console import Console
 from oodd_eval.cli.main import main
 from oodd_eval.cli.terminal import TerminalReporter
 from oodd_eval.metrics.bootstrap import bounds, drawn_cell, sample_cells
-from oodd_eval.metrics.catalogue import PAPER, metric_info
+from oodd_eval.metrics.catalogue import PAPER
 from oodd_eval.prose import print_prose
 from oodd_eval.results import tables
 from oodd_eval.results.board import Board, boards, contribution
@@ -56,12 +56,7 @@ TITLES = {  # by the start of a title: columns of labels, and one number: row, c
     "Guaranteed alarms at 5 % (%)": (1, "riqn", "found within 20", "50.0"),
     "Guaranteed alarms at 5 % (delays in steps": (1, "riqn", "delay if found", "8.0"),
     f"{PAPER} (delays in steps, the rest as shares)": (1, "riqn", "delay", "3.2"),
-    f"{PAPER}. AUC (%), delay (steps), false-alarm rate (FAR), sensor": (
-        2,
-        "Hopper",
-        "AVG",
-        "85.0",
-    ),
+    f"{PAPER}. AUC (%), delay (steps), false-alarm rate (FAR), sen": (2, "Hopper", "AVG", "85.0"),
     f"{PAPER}. AUC (%), delay (steps), false-alarm rate (FAR), dyn": (2, "Hopper", "riqn", "80.0"),
     "All metrics of separability (%), mean over cells": (1, "riqn", "AUC", "85.0"),
     "riqn: matched AUC": (1, "Hopper", "gravity", "65.0"),
@@ -127,6 +122,7 @@ def test_formats_for_people_have_the_same_titles_and_cells(name):
         parser.feed(text)
         assert parser.tags.count("table") == len(report.sections[0].tables)
         text = " ".join(parser.texts)
+    assert text.index("riqn") < text.index("Cells: ")  # the verdict comes first
     for table in report.sections[0].tables:
         assert table.rows[0][-1].partition(" [")[0].rstrip("*") in text
         assert table.title.partition("%")[0].rstrip("( ") in text
@@ -260,24 +256,17 @@ def test_no_table_mixes_digests_protocols_or_limits():
 # Means
 
 
-def test_a_mean_over_fewer_cells_is_marked():
-    board = Board([make_record(), make_record(anomaly="drift"), make_record("rf")])
-    texts = {row[0]: row[1] for row in tables.separability(board).rows}
-    assert texts == {"riqn": "50.0", "rf": "50.0*"}
-
-
-def test_seeds_are_averaged_into_one_row():
+def test_means_over_seeds_over_fewer_cells_and_with_intervals():
     board = Board([
         make_record(seed=0, values={"auc_matched": [0.4, 0.4]}),
         make_record(seed=1, values={"auc_matched": [0.8, 0.8]}),
+        make_record("rf"), make_record("rf", anomaly="drift"),
     ])  # fmt: skip
-    assert [row[:2] for row in tables.separability(board).rows] == [["riqn", "60.0"]]
+    texts = {row[0]: row[1] for row in tables.separability(board).rows}
+    assert texts == {"riqn": "60.0*", "rf": "50.0"}  # one of two cells is marked
     # Trajectories agree within each seed, so that the interval is the seeds' alone.
     value = board.mean(board.entries[0], ["hopper"], ["iid"], "auc_matched", intervals=True)
     assert (value.low, value.high) == (0.4, 0.8)
-
-
-def test_interval_of_one_seed_is_the_bootstrap_over_test_trajectories():
     records = [
         make_record(anomaly=a, values={"auc_matched": v})
         for a, v in (("iid", [0.1, 0.9]), ("drift", [0.2, 0.6]))
@@ -288,20 +277,6 @@ def test_interval_of_one_seed_is_the_bootstrap_over_test_trajectories():
     drawn = [drawn_cell("hopper", 0, contribution(r, "auc_matched")) for r in records]
     assert (value.low, value.high) == pytest.approx(bounds(sample_cells(drawn), 0.45, [2]))
     assert value.value == pytest.approx((0.5 + 0.4) / 2)
-
-
-def test_columns_are_explained_below_the_first_table_and_that_of_the_papers_alarm():
-    values = ("auc_matched", "auc_smoothed", "delay", "delay_null", "far", "far_twin")
-    text = rendered([make_record(values={name: [0.5, 0.5] for name in values})])
-    assert "\nsmoothed = matched AUC of scores after one moving average" in text
-    assert "(delays in steps, the rest as shares)" in text
-    assert "delay null = steps to the first alarm on the nominal twin: what false" in text
-    assert "FAR twin = false-alarm rate over whole nominal twins." in text
-
-
-def test_no_zero_has_a_sign():
-    for name in ("far", "auc", "delay"):
-        assert "-" not in metric_info(name).text(-1e-9)
 
 
 # Findings and notes
@@ -334,16 +309,9 @@ def test_notes_name_the_split_and_what_is_missing():
     records = [make_record(limit=3), make_record(anomaly="drift", limit=3)]
     records[1].provenance["git_dirty"] = True
     notes = " ".join(tables.notes(Board(records)))
-    for phrase in (
-        "Split mini, digest abababababab, protocol 1",
-        "first 3 trajectories",
-        "sensor anomalies are without calibration, shutdown.",
-        "uncommitted changes of oodd-eval's checkout: 1 cell.",
-    ):
-        assert phrase in notes
+    facts = "digest abababababab", "first 3 trajectories", "calibration, shutdown", ": 1 cell."
+    assert all(fact in notes for fact in facts)
     assert "uncommitted" not in " ".join(tables.notes(Board(records[:1])))
-    records[0].provenance["git_dirty"] = True
-    assert "oodd-eval's checkout: 2 cells." in " ".join(tables.notes(Board(records)))
 
 
 ALARMS = {
@@ -434,13 +402,13 @@ def test_compare_says_first_who_is_better_by_scores_and_by_alarms(tmp_path, caps
     (tmp_path / "records.jsonl").write_text("".join(r.to_json() + "\n" for r in records))
     assert main(["compare", str(tmp_path), "mewma", "rf"]) == 0
     first, figures, second, steps, *_ = capsys.readouterr().out.splitlines()
-    assert first == "rf beats mewma by 20.0 points [20.0, 20.0] in matched AUC on Hopper."
+    assert first.startswith("rf beats mewma by 20.0 points [20.0, 20.0]")
     assert re.fullmatch(r"matched AUC: mewma 55.0 %, rf 75.0 %, p = [\d.e-]+, 1 cell", figures)
-    assert second.startswith("mewma beats rf by 2.0 steps [2.0, 2.0] in delay censored at 5 % on")
-    assert steps.startswith("Delay censored at 5 %: mewma 5.5 steps, rf 7.5 steps, p = ")
+    assert second.startswith("mewma beats rf by 2.0 steps [2.0, 2.0]")
+    assert "mewma 5.5 steps, rf 7.5 steps, p = " in steps
 
 
-def test_no_difference_is_shown_where_the_interval_includes_zero():
+def test_no_difference_is_shown_where_the_interval_includes_zero_or_p_is_large():
     # Half of the episodes are a tenth better, the others a tenth worse: the mean difference is 0.
     records = rows(mewma=[0.6, 0.7] * 6, rf=[0.7, 0.6] * 6)
     compared = compare_rows(records, "rf", "mewma")
@@ -448,22 +416,14 @@ def test_no_difference_is_shown_where_the_interval_includes_zero():
     text = verdict_of(Board(records))
     assert text.startswith("No difference is shown between mewma and rf in matched AUC on CartPole")
     ends = f"[-{100 * compared.high:.1f}, {100 * compared.high:.1f}]"
-    assert text.endswith(f": 0.0 points {ends}, p = 1 (the interval holds 0, and p is above 0.05).")
+    assert f": 0.0 points {ends}, p = 1 (" in text
     assert str(compared).count("p = ") == 1
-
-
-@pytest.mark.parametrize(
-    ("low", "p", "why"),
-    [
-        (-0.1, 0.002, "p is at most 0.05, but the interval holds 0"),
-        (0.1, 0.67, "the interval leaves out 0, but p is above 0.05"),
-    ],
-)
-def test_the_verdict_says_which_criterion_fails(low, p, why):
-    compared = compare_rows(rows(mewma=[0.5, 0.6] * 6, rf=[0.7, 0.8] * 6), "rf", "mewma")
-    text = replace(compared, low=low, p=p).verdict
-    assert text.startswith("No difference is shown between rf and mewma")
-    assert text.endswith(f", p = {p:g} ({why}).")
+    clear = compare_rows(rows(mewma=[0.5, 0.6] * 6, rf=[0.7, 0.8] * 6), "rf", "mewma")
+    assert clear.verdict.startswith("rf beats mewma")
+    for low, p in ((-0.1, 0.002), (0.1, 0.67)):
+        text = replace(clear, low=low, p=p).verdict
+        assert text.startswith("No difference is shown between rf and mewma")
+        assert f", p = {p:g} (" in text
 
 
 def test_the_verdict_on_one_row_is_its_headline_in_words():
@@ -490,13 +450,6 @@ def test_rows_that_failed_or_know_more_than_nominal_episodes_are_no_second_best(
     assert text.startswith("rf beats mewma by 10.0 points")
 
 
-@pytest.mark.parametrize("name", ["markdown", "html", "latex"])
-def test_the_verdict_is_the_first_sentence_of_every_format(name):
-    records = rows(mewma=[0.5] * 12, rf=[0.6] * 12)
-    text = rendered(records, name)
-    assert text.index("rf beats mewma by 10.0 points") < text.index("Cells: 2")
-
-
 # Figures that are undefined
 
 
@@ -509,55 +462,43 @@ def calibrated(detector, episodes, alarm="cusum", level="5", environment="hopper
 
 def test_a_level_that_calibration_episodes_are_too_few_for_is_named():
     # A CUSUM standardizes with half of them: 2 x 19 are needed at 5 %, 2 x 9 at 10 %.
-    reason = "30 calibration episodes; 38 needed at 5 %, or --level 10"
-    few = calibrated("rf", 30, level="10")
-    assert f"rf: guaranteed alarms at 5 % ({reason})." in tables.guaranteed(Board([few])).note
+    few, strict = calibrated("rf", 30, level="10"), calibrated("pe", 40)
+    assert "rf: guaranteed alarms at 5 % (30" in tables.guaranteed(Board([few])).note
     mixed = Board([few, calibrated("pe", 30, "score")])
     table = tables.guaranteed(mixed)
     assert "at 5 %" in table.title
     assert cells(table, 0) == dict.fromkeys(table.header, "\N{EN DASH}") | {"detector": "rf"}
-    assert f"Undefined for rf: missed, false episodes, early ({reason})." in table.note
-    chosen = next(
-        t for t in Report([few], level="at_10pct").sections[0].tables if "Guar" in t.title
-    )
-    assert "at 10 %" in chosen.title
-    assert "calibration" not in chosen.note
-    strict = Report([calibrated("pe", 40)], level="at_1pct", detail="brief").sections[0]
-    assert not [t for t in strict.tables if "Guaranteed" in t.title]
-    reason = "40 calibration episodes; 198 needed at 1 %, or --level 5"
-    assert f"Undefined for pe: guaranteed alarms at 1 % ({reason})." in strict.findings
+    assert "Undefined for rf: missed, false episodes, early (30" in table.note
+    (section,) = Report([few], level="at_10pct").sections
+    (chosen,) = [t for t in section.tables if "Guar" in t.title and "steps" not in t.title]
+    assert ("at 10 %" in chosen.title, "calibration" in chosen.note) == (True, False)
+    (section,) = Report([strict], level="at_1pct", detail="brief").sections
+    assert not [t for t in section.tables if "Guaranteed" in t.title]
+    assert any("pe: guaranteed alarms at 1 % (40" in text for text in section.findings)
     # Without any level there is no table, and the report says why.
     none = replace(calibrated("rf", 17), metrics={}, per_trajectory={})
     assert tables.guaranteed(Board([none])) is None
-    assert "(17 calibration episodes; 38 needed at 5 %)." in " ".join(findings_of(Board([none])))
-
-
-def test_enough_calibration_episodes_leave_no_reason():
-    for episodes, alarm in ((38, "cusum"), (19, "score")):
-        assert (
-            "calibration" not in tables.guaranteed(Board([calibrated("pe", episodes, alarm)])).note
-        )
-    for episodes, alarm, needed in ((37, "cusum", 38), (18, "score", 19)):
-        record = replace(calibrated("pe", episodes, alarm), metrics={}, per_trajectory={})
-        text = why_undefined(record, "missed_at_5pct")
-        assert text.startswith(f"{episodes} calibration episodes; {needed} needed at 5 %")
+    assert "(17 calibration episodes" in " ".join(findings_of(Board([none])))
 
 
 @pytest.mark.parametrize(
-    ("metric", "reason"),
-    [
-        (
-            "delay_at_5pct",
-            "pe: delay if found (no episode has its first alarm from the effect on).",
-        ),
-        ("auc_placebo", "pe: placebo (no two twins both have a defined score from the effect on)."),
-        ("delay", "pe: delay (no episode has an alarm from the onset on)."),
-    ],
+    ("episodes", "alarm", "needed"),
+    [(37, "cusum", 38), (38, "cusum", 0), (18, "score", 19), (19, "score", 0)],
 )
-def test_the_reason_of_a_dash_stands_below_its_table(metric, reason):
-    records = [calibrated("pe", 40, **{metric: [None, None]}), calibrated("rf", 40)]
+def test_the_number_of_calibration_episodes_is_a_reason_where_it_is_one(episodes, alarm, needed):
+    record = calibrated("pe", episodes, alarm)
+    note = tables.guaranteed(Board([record])).note
+    if not needed:
+        assert "calibration" not in note
+        return
+    text = why_undefined(replace(record, metrics={}, per_trajectory={}), "missed_at_5pct")
+    assert text.startswith(f"{episodes} calibration episodes; {needed} needed at 5 %")
+
+
+def test_the_reason_of_a_dash_stands_below_its_table():
+    records = [calibrated("pe", 40, delay=[None, None]), calibrated("rf", 40)]
     notes = [t.note for t in Report(records).sections[0].tables]
-    assert any(reason in note for note in notes)
+    assert any("pe: delay (no episode has an alarm" in note for note in notes)
     assert "pe, rf" not in " ".join(notes)
 
 
@@ -583,17 +524,6 @@ def test_all_that_a_cell_leaves_undefined_has_its_reason(anomalous, twin, effect
     assert undefined
     assert all(why_undefined(record, name) for name in undefined)
     assert not any(why_undefined(record, name) for name in metrics.keys() - {*undefined})
-
-
-def test_metrics_of_other_cells_say_which_episodes_they_need():
-    record = make_record()
-    assert why_undefined(record, "auc_pool") == "it is for episodes without nominal twins"
-    logs = replace(record, paired=False, metrics={})
-    assert why_undefined(logs, "auc_matched") == "the episodes have no nominal twins"
-    assert why_undefined(logs, "vus_pr") == "it is computed with --row-metrics alone"
-    assert "explain" in why_undefined(record, "sensor_named_at_5pct")
-    noted = replace(record, note="auc_matched, auc_smoothed are withheld: no twins", metrics={})
-    assert why_undefined(noted, "auc_smoothed") == "no twins"
 
 
 # The terminal
