@@ -9,6 +9,11 @@ import warnings
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+# A slow machine is no error.
+settings.register_profile("tests", deadline=None)
+settings.load_profile("tests")
 
 # Two workers on two cores: numerical libraries get one thread each.
 os.environ.setdefault("OMP_NUM_THREADS", "1")

@@ -164,6 +164,8 @@ def test_found_within_k_counts_rows_that_both_episodes_have(k):
     # No row is shared from the effect on.
     found = guaranteed_contributions(list(rows), [np.zeros(effect)] * 2, [effect] * 2, ABOVE_ONE)
     assert terms(found, own) == terms(found, null) == [(0, 0)] * 2
+    # A twin that ended there has missed nothing.
+    assert terms(found, "missed_null") == terms(found, "delay_censored_null") == [(0, 0)] * 2
     assert terms(found, "delay_censored") == [(3, 1)] * 2
 
 

@@ -3,10 +3,11 @@
 import copy
 import dataclasses
 import math
+import re
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -69,7 +70,6 @@ def test_roc_is_the_polygon_of_counted_rates(positives, negatives):
     np.testing.assert_allclose(roc(positives, negatives, np.array(FPR)), expected, atol=1e-12)
 
 
-@settings(deadline=None)
 @given(st.integers(0, 10**6))
 def test_area_under_one_curve_is_its_auc(seed):
     rng = np.random.default_rng(seed)
@@ -154,13 +154,9 @@ def test_example_shows_rows_around_the_onset_in_standard_deviations():
     assert found["cusum"] == pytest.approx(statistic[60:160])
     assert found["alarms"] == [int(t) for t in np.flatnonzero(alarms) if 60 <= t < 160]
     assert found["twin_alarms"] == [t for t in found["alarms"] if t < 120]
-
-
-def test_example_has_none_where_a_score_is_undefined():
     scores = np.concatenate([[NAN, NAN], np.ones(60)])
     found = example([scores], [scores], [30], [30], RULE)
-    assert found["scores"][:3] == [None, None, 1.0]
-    assert found["cusum"][:2] == [0.0, 0.0]
+    assert (found["scores"][:3], found["cusum"][:2]) == ([None, None, 1.0], [0.0, 0.0])
 
 
 # -- from stored scores ---------------------------------------------------------------------------
@@ -170,8 +166,8 @@ def test_example_has_none_where_a_score_is_undefined():
 def stored(tiny_split, tmp_path_factory):
     """Records of a run, the directory with its scores, and the curves made of them."""
     output = tmp_path_factory.mktemp("results")
-    records = evaluate("persistence", tiny_split, environments="cartpole", output=output)
-    records = [r for r in records if r.anomaly in ("iid", "gravity")]
+    cells = {"environments": "cartpole", "anomalies": "iid,gravity"}
+    records = evaluate("persistence", tiny_split, output=output, **cells)
     results = ResultsDirectory(output)
     return records, results, make_curves(records, results, load_split(tiny_split))
 
@@ -193,16 +189,12 @@ def test_curves_of_a_run_agree_with_its_records(stored):
         assert unit["example"]["auc_matched"] == pytest.approx(np.median(areas), rel=1e-2)
 
 
-def test_curves_with_another_split_are_refused(stored, tiny_split):
-    records, results, _ = stored
-    other = dataclasses.replace(records[0], split_digest="ab" * 32)
-    with pytest.raises(ResultsError, match="digest abababababab, but split 'tiny' here has"):
-        make_curves([other], results, load_split(tiny_split))
-
-
 def test_written_curves_are_read_back(stored, tmp_path):
     write_curves(stored[2], tmp_path / "curves.json")
     assert read_curves(tmp_path / "curves.json") == stored[2]
+    assert rounded({"a": [1 / 3, 2.0, 123456.0, 1e-9], "b": None, "c": math.inf}) == {
+        "a": [0.333, 2, 123000, 0], "b": None, "c": 10**12,
+    }  # fmt: skip
     # 56 cells have to stay below 250 kB.
     assert (tmp_path / "curves.json").stat().st_size / 2 < 250_000 / 56
 
@@ -217,72 +209,48 @@ def test_files_that_are_no_json_are_refused(tmp_path, text):
 
 
 DAMAGE = [
-    (("schema",), 2, "schema is 2"),
-    (("schema",), True, "schema is True"),
-    (("units",), {}, "units is {}"),
-    (("more",), 1, "more is 1"),
-    (("units", 0), [], "units[0] is []"),
-    (("units", 0, "cell"), 7, "units[0].cell is 7"),
-    (("units", 0, "environment"), "moon", "units[0].environment is 'moon'"),
-    (("units", 0, "anomaly"), "x", "units[0].anomaly is 'x'"),
-    (("units", 0, "horizon"), "1", "units[0].horizon is '1'"),
-    (("units", 0, "seed"), False, "units[0].seed is False"),
-    (("units", 0, "roc"), {"fpr": []}, "units[0].roc.tpr is "),
-    (("units", 0, "roc", "tpr"), [0.5], "units[0].roc.tpr is '1 numbers'"),
-    (("units", 0, "roc", "tpr"), [0.5] * 2000, "units[0].roc.tpr is ["),
-    (("units", 0, "roc", "tpr", 3), 1.1, "units[0].roc.tpr[3] is 1.1"),
-    (("units", 0, "roc", "tpr", 3), True, "units[0].roc.tpr[3] is True"),
-    (("units", 0, "roc", "fpr", 2), 0.0, "units[0].roc.fpr[2] is 0.0"),
-    (("units", 0, "roc", "fpr", 2), math.nan, "units[0].roc.fpr[2] is nan"),
-    (("units", 0, "roc", "fpr", 2), "0.1", "units[0].roc.fpr[2] is '0.1'"),
-    (("units", 0, "delay_far", "far", 0), -0.1, "units[0].delay_far.far[0] is -0.1"),
-    (("units", 0, "delay_far", "delay_censored", 0), math.inf, "delay_censored[0] is inf"),
-    (("units", 0, "delay_far", "delay_censored", 0), 10**400, "delay_censored[0] is 1000"),
-    (("units", 0, "example", "index"), -1, "units[0].example.index is -1"),
-    (("units", 0, "example", "index"), 1.0, "units[0].example.index is 1.0"),
-    (("units", 0, "example", "auc_matched"), 2, "units[0].example.auc_matched is 2"),
-    (("units", 0, "example", "onset"), 999, "units[0].example.onset is 999"),
-    (("units", 0, "example", "start"), 60, "units[0].example.start is 60"),
-    (("units", 0, "example", "scores"), [], "units[0].example.scores is '0 numbers'"),
-    (("units", 0, "example", "scores", 1), 1e16, "units[0].example.scores[1] is 1e+16"),
-    (("units", 0, "example", "cusum", 1), None, "units[0].example.cusum[1] is None"),
-    (("units", 0, "example", "cusum", 1), -1, "units[0].example.cusum[1] is -1"),
-    (("units", 0, "example", "alarms"), [500], "units[0].example.alarms[0] is 500"),
-    (("units", 0, "example", "alarms"), [1.5], "units[0].example.alarms[0] is 1.5"),
+    ("schema", 2),
+    ("schema", True),
+    ("units", {}),
+    ("more", 1),
+    ("units.0", []),
+    ("units.0.cell", 7),
+    ("units.0.environment", "moon"),
+    ("units.0.anomaly", "x"),
+    ("units.0.horizon", "1"),
+    ("units.0.seed", False),
+    ("units.0.roc.tpr", [0.5]),
+    ("units.0.roc.tpr", [0.5] * 2000),
+    ("units.0.roc.tpr.3", 1.1),
+    ("units.0.roc.fpr.2", 0.0),  # they rise
+    ("units.0.roc.fpr.2", math.nan),
+    ("units.0.delay_far.far.0", -0.1),
+    ("units.0.delay_far.delay_censored.0", math.inf),
+    ("units.0.delay_far.delay_censored.0", 10**400),
+    ("units.0.example.index", 1.0),
+    ("units.0.example.auc_matched", 2),
+    ("units.0.example.onset", 999),
+    ("units.0.example.start", 60),
+    ("units.0.example.scores", []),
+    ("units.0.example.scores", [0] * 500),
+    ("units.0.example.scores.1", 1e16),
+    ("units.0.example.cusum.1", None),
+    ("units.0.example.alarms.0", 500),
+    ("units.1.cell", "the first one's"),
 ]
 
 
-@pytest.mark.parametrize(("path", "value", "message"), DAMAGE, ids=lambda x: str(x)[:40])
-def test_every_damaged_field_is_named(stored, path, value, message):
+@pytest.mark.parametrize(("path", "value"), DAMAGE, ids=lambda x: str(x)[:40])
+def test_every_damaged_field_is_named(stored, path, value):
     plain = copy.deepcopy(stored[2])
-    *way, last = path
-    place = plain
+    place = {"": plain}
+    *way, last = (int(step) if step.isdigit() else step for step in ["", *path.split(".")])
     for step in way:
         place = place[step]
-    place[last] = value
+    place[last] = plain["units"][0]["cell"] if path == "units.1.cell" else value
+    if path.endswith("alarms.0"):
+        plain["units"][0]["example"]["alarms"] = [value]
     with pytest.raises(ResultsError) as caught:
         check_curves(plain, "curves.json")
-    assert str(caught.value).startswith("curves.json: ")
-    assert message in str(caught.value)
-
-
-def test_a_cell_may_occur_once(stored):
-    plain = copy.deepcopy(stored[2])
-    plain["units"][1]["cell"] = plain["units"][0]["cell"]
-    with pytest.raises(ResultsError, match=r"units\[1\].cell is .* before"):
-        check_curves(plain, "curves.json")
-
-
-def test_an_example_ends_with_its_trajectory(stored):
-    plain = copy.deepcopy(stored[2])
-    example = plain["units"][0]["example"]
-    example["scores"] += [0] * 100
-    example["cusum"] += [0] * 100
-    with pytest.raises(ResultsError, match=r"example.scores is .* at most length - start"):
-        check_curves(plain, "curves.json")
-
-
-def test_numbers_are_rounded_for_drawing():
-    assert rounded({"a": [1 / 3, 2.0, 123456.0, 1e-9], "b": None, "c": math.inf}) == {
-        "a": [0.333, 2, 123000, 0], "b": None, "c": 10**12,
-    }  # fmt: skip
+    name = re.sub(r"\.(\d+)", r"[\1]", path)
+    assert str(caught.value).startswith(f"curves.json: {name}")

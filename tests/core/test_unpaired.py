@@ -10,7 +10,7 @@ import pytest
 from helpers_logs import UNPAIRED, log_parts, make_log_split, write_log_split
 from helpers_plugins import local_spec
 from helpers_split import make_split
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from oodd_eval import evaluate, load_results, load_split
@@ -141,7 +141,6 @@ def cases(draw, *, clock=None):
     )
 
 
-@settings(deadline=None)
 @given(cases())
 def test_pooled_aucs_are_those_of_all_pairs(case):
     found = separability(case, SCORE)
@@ -152,7 +151,6 @@ def test_pooled_aucs_are_those_of_all_pairs(case):
         assert contribution.nominal == case.sizes[0]
 
 
-@settings(deadline=None)
 @given(cases())
 def test_terms_of_nominal_episodes_are_what_one_more_of_them_changes(case):
     terms = separability(case, SCORE)["auc_pool"]
@@ -166,7 +164,6 @@ def test_terms_of_nominal_episodes_are_what_one_more_of_them_changes(case):
         assert influence == pytest.approx(expected, abs=1e-4)
 
 
-@settings(deadline=None)
 @given(cases())
 def test_terms_of_the_null_are_what_one_more_nominal_episode_changes(case):
     case = dataclasses.replace(case, intervals=[((0, 4),)] * len(case.anomalous))
@@ -193,7 +190,6 @@ def test_terms_of_the_null_are_what_one_more_nominal_episode_changes(case):
         assert influences[j] == pytest.approx(expected, abs=1e-4)
 
 
-@settings(deadline=None)
 @given(cases(), st.sampled_from([np.exp, np.cbrt, lambda x: 3 * x - 7]))
 def test_a_monotone_transform_changes_no_auc(case, transform):
     other = dataclasses.replace(
@@ -206,7 +202,6 @@ def test_a_monotone_transform_changes_no_auc(case, transform):
         assert np.array_equal(found[0][name].numerator, found[1][name].numerator)
 
 
-@settings(deadline=None)
 @given(cases(clock=True))
 def test_what_knows_the_time_alone_has_one_half_exactly(case):
     timed = dataclasses.replace(
