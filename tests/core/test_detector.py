@@ -38,11 +38,6 @@ def test_scores_of_any_real_type_become_float64(scores):
     assert checked.tolist() == [0.0, 1.0, 0.0, 1.0, 1.0, 0.0]
 
 
-def test_nan_of_other_types_is_undefined_too():
-    assert np.isnan(check([float("nan"), 1, 2, 3, 4, 5])[0])
-    assert np.isnan(check(np.array([np.nan, 1, 2, 3, 4, 5], np.float32))[0])
-
-
 class Seeded:
     def __init__(self, seed):
         self.seed = seed
@@ -94,6 +89,10 @@ def test_nan_is_allowed_in_the_leading_block(undefined):
     scores = np.zeros(6)
     scores[:undefined] = np.nan
     assert check(scores, warm_up=3) is scores
+    others = check(scores.tolist(), warm_up=3), check(scores.astype("f4"), warm_up=3)
+    assert all(np.array_equal(other, scores, equal_nan=True) for other in others)
+    with pytest.raises(ContractError, match="in one leading block only"):
+        check(np.array([0, np.nan, 0, 0, 0, 0]), horizon=3)
 
 
 def test_a_trajectory_shorter_than_the_block_may_be_undefined_throughout():
@@ -126,11 +125,6 @@ def test_broken_scores_are_named(scores, message):
         check(scores)
 
 
-def test_nan_after_a_defined_score_is_refused_even_inside_the_block():
-    with pytest.raises(ContractError, match="in one leading block only"):
-        check(np.array([0, np.nan, 0, 0, 0, 0]), horizon=3)
-
-
 @pytest.mark.parametrize("warm_up", [-1, 21, 1.0, True])
 def test_warm_up_is_an_int_of_at_most_twenty(warm_up):
     with pytest.raises(ContractError, match="between 0 and 20"):
@@ -150,20 +144,13 @@ def test_every_error_is_also_a_builtin():
                    for base in kind.__mro__[1:-3]), kind  # fmt: skip
 
 
-def test_unknown_name_suggests_the_nearest():
+def test_an_unknown_name_comes_with_the_nearest_and_with_some_of_the_others():
     message = str(UnknownNameError("environment", "hoper", ["ant", "hopper"]))
     assert message == "unknown environment 'hoper': did you mean 'hopper'? Known: ant, hopper"
-
-
-def test_unknown_name_far_from_all_lists_them():
-    assert "did you mean" not in str(UnknownNameError("detector", "zzz", ["rf", "npn"]))
-
-
-def test_of_a_thousand_names_a_message_lists_some():
-    message = str(UnknownNameError("column", "zzz", [f"topic.{i}" for i in range(1000)]))
-    assert len(message) < 1000
-    assert "and 940 more" in message
-    near = UnknownNameError("column", "topik.7", [f"topic.{i}" for i in range(1000)])
+    many = [f"topic.{i}" for i in range(1000)]
+    message = str(UnknownNameError("column", "zzz", many))
+    assert ("did you mean" in message, "and 940 more" in message) == (False, True)
+    near = UnknownNameError("column", "topik.7", many)
     assert str(near) == "unknown column 'topik.7': did you mean 'topic.7'?"
 
 

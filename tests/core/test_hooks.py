@@ -55,20 +55,6 @@ def watched(tiny_split):
     return carry_out
 
 
-def test_oodd_environments(monkeypatch, tmp_path):
-    install(monkeypatch, tmp_path, "basin", BASIN, header="")
-    found = discover(only=["basin"]).custom_specs
-    spec, origin = found["valve"]
-    assert origin == "plug-in 'basin' of oodd-basin"
-    assert [quantity.name for quantity in spec.actions] == ["close", "open"]
-
-
-def test_oodd_anomalies(monkeypatch, tmp_path):
-    install(monkeypatch, tmp_path, "basin", BASIN, header="")
-    spec, _ = discover(only=["basin"]).custom_specs["seep"]
-    assert (spec.group, spec.bound) == ("dynamics", 3.0)
-
-
 def test_oodd_detectors(monkeypatch, tmp_path):
     code = """
     @hookimpl
@@ -76,6 +62,15 @@ def test_oodd_detectors(monkeypatch, tmp_path):
     """
     install(monkeypatch, tmp_path, "mine", code)
     assert discover().offer("mine").distribution == "oodd-mine"
+
+
+def test_oodd_environments_and_anomalies(monkeypatch, tmp_path):
+    install(monkeypatch, tmp_path, "basin", BASIN, header="")
+    specs = discover(only=["basin"]).custom_specs
+    (valve, origin), (seep, _) = specs["valve"], specs["seep"]
+    assert origin == "plug-in 'basin' of oodd-basin"
+    assert [quantity.name for quantity in valve.actions] == ["close", "open"]
+    assert (seep.group, seep.bound) == ("dynamics", 3.0)
 
 
 MAKER = """
@@ -95,7 +90,7 @@ MAKER = """
     """
 
 
-def test_oodd_detector_from_spec(monkeypatch, tmp_path):
+def test_oodd_detector_from_spec(monkeypatch, tmp_path, capsys):
     install(monkeypatch, tmp_path, "maker", MAKER)
     plugins = discover()
     assert "mine:7" not in plugins.offers
@@ -104,27 +99,23 @@ def test_oodd_detector_from_spec(monkeypatch, tmp_path):
     assert (offer.distribution, offer.version) == ("oodd-maker", "1.0+lib.2")
     assert plugins.offer("mine:7") is offer
     assert plugins.select("clock, mine:8,mine:07") == ["clock", "mine:8", "mine:7"]
-
-
-def test_list_tells_which_names_with_a_colon_there_are(monkeypatch, tmp_path, capsys):
-    install(monkeypatch, tmp_path, "maker", MAKER)
     assert main(["list", "detectors"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    (line,) = [line for line in lines if line.startswith("(maker)")]
+    (line,) = [n for n in capsys.readouterr().out.splitlines() if n.startswith("(maker)")]
     assert " ".join(line.split()) == "(maker) oodd-maker 1.0 mine:N: a detector of the number N"
 
 
-def test_a_plugin_that_fails_to_make_a_detector_is_named(monkeypatch, tmp_path):
-    install(monkeypatch, tmp_path, "maker", MAKER)
-    with pytest.raises(PluginError, match=r"'maker' of oodd-maker failed to make .*'mine:x': Val"):
-        discover().offer("mine:x")
-
-
-@pytest.mark.parametrize("made", ['"text"', 'DetectorSpec("rf", Good, "")'])
-def test_a_plugin_may_not_make_something_else(monkeypatch, tmp_path, made):
+@pytest.mark.parametrize(
+    ("made", "message"),
+    [
+        ("1 / 0", "'odd' of oodd-odd failed to make .*'odd:1': ZeroDiv"),
+        ('"text"', "expected None or a DetectorSpec whose name has a colon"),
+        ('DetectorSpec("rf", Good, "")', "expected None or a DetectorSpec whose name has a colon"),
+    ],
+)
+def test_a_plugin_that_makes_no_detector_is_named(monkeypatch, tmp_path, made, message):
     code = f"@hookimpl\ndef oodd_detector_from_spec(spec): return {made} if 'odd' in spec else None"
     install(monkeypatch, tmp_path, "odd", code)
-    with pytest.raises(PluginError, match="expected None or a DetectorSpec whose name has a colon"):
+    with pytest.raises(PluginError, match=message):
         discover().offer("odd:1")
 
 
@@ -153,30 +144,36 @@ def oodd_detectors(): return offer(tells=Tells, silent=Good)
 """
 
 
+@pytest.fixture
+def tell(tiny_split, monkeypatch, tmp_path):
+    """Run a detector of a plug-in, and return its records and the shares that were heard."""
+
+    def carry_out(detector, code=TELLS):
+        install(monkeypatch, tmp_path, "talker", code)
+        monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+        heard, plugins, split = [], discover(), load_split(tiny_split)
+
+        class Listener:
+            @hookimpl
+            def oodd_fit_progressed(self, unit, share):
+                heard.append((unit.environment, share))
+
+        plan = make_plan(plugins, split=split, detectors=[detector], environments=["cartpole"])
+        return run(plan, split, plugins, RunSettings(jobs=1), observers=[Listener()]).records, heard
+
+    return carry_out
+
+
 @pytest.mark.parametrize(("detector", "shares"), [("tells", [0.25, 1.0]), ("silent", [1.0])])
-def test_oodd_fit_progressed(tiny_split, monkeypatch, tmp_path, detector, shares):
-    install(monkeypatch, tmp_path, "talker", TELLS)
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    heard, plugins, split = [], discover(), load_split(tiny_split)
-
-    class Listener:
-        @hookimpl
-        def oodd_fit_progressed(self, unit, share):
-            heard.append((unit.environment, share))
-
-    plan = make_plan(plugins, split=split, detectors=[detector], environments=["cartpole"])
-    done = run(plan, split, plugins, RunSettings(jobs=1), observers=[Listener()])
-    assert {record.status for record in done.records} == {"ok"}
+def test_oodd_fit_progressed(tell, detector, shares):
+    records, heard = tell(detector)
+    assert {record.status for record in records} == {"ok"}
     assert heard == [("cartpole", share) for share in shares]
 
 
 @pytest.mark.parametrize("share", ["2", "float('nan')"])
-def test_a_share_that_is_none_is_the_detectors_error(tiny_split, monkeypatch, tmp_path, share):
-    install(monkeypatch, tmp_path, "talker", TELLS.replace("0.25", share))
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    plugins, split = discover(), load_split(tiny_split)
-    plan = make_plan(plugins, split=split, detectors=["tells"], environments=["cartpole"])
-    (record, *_) = run(plan, split, plugins, RunSettings(jobs=1)).records
+def test_a_share_that_is_none_is_the_detectors_error(tell, share):
+    (record, *_), _ = tell("tells", TELLS.replace("0.25", share))
     assert (record.status, "progress" in record.reason) == ("invalid", True)
 
 
@@ -193,26 +190,19 @@ def install_observer(monkeypatch, path, name, code):
     install(monkeypatch, path, name, code, group="oodd_eval.observers")
 
 
-def test_a_plugin_of_the_group_of_observers_hears_of_every_run(watched, monkeypatch, tmp_path):
-    install_observer(monkeypatch, tmp_path, "nosy", OBSERVES)
-    watched()
-    assert sys.modules["oodd_nosy"].HEARD == ["started", ("finished", False)]
-
-
-def test_a_detector_plugin_observes_the_runs_that_it_was_loaded_for(watched, monkeypatch, tmp_path):
-    install(monkeypatch, tmp_path, "nosy", OBSERVES)
-    watched()
-    assert "oodd_nosy" not in sys.modules
-    plugins = discover()
-    assert plugins.offers
-    watched(plugins)
-    assert sys.modules["oodd_nosy"].HEARD == ["started", ("finished", False)]
-
-
-def test_a_module_in_both_groups_is_called_once(watched, monkeypatch, tmp_path):
-    install(monkeypatch, tmp_path / "a", "nosy", OBSERVES)
-    points = tmp_path / "a" / "oodd_nosy-1.0.dist-info" / "entry_points.txt"
-    points.write_text("[oodd_eval]\nnosy=oodd_nosy\n[oodd_eval.observers]\nnosy=oodd_nosy\n")
+@pytest.mark.parametrize("group", ["oodd_eval.observers", "oodd_eval", "both"])
+def test_a_plugin_observes_the_runs_that_it_was_loaded_for_once(
+    watched, monkeypatch, tmp_path, group
+):
+    install(
+        monkeypatch, tmp_path, "nosy", OBSERVES, group="oodd_eval" if group == "both" else group
+    )
+    if group == "both":
+        points = tmp_path / "oodd_nosy-1.0.dist-info" / "entry_points.txt"
+        points.write_text("[oodd_eval]\nnosy=oodd_nosy\n[oodd_eval.observers]\nnosy=oodd_nosy\n")
+    if group == "oodd_eval":  # a plug-in of detectors that are not asked for
+        watched()
+        assert "oodd_nosy" not in sys.modules
     plugins = discover()
     assert plugins.offers
     watched(plugins)

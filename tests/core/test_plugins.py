@@ -7,7 +7,6 @@ import pytest
 from helpers_plugins import install
 from oodd_trivial import Clock
 
-from oodd_eval.cli.main import main
 from oodd_eval.errors import MissingExtraError, PluginError, UnknownNameError, UsageError
 from oodd_eval.plugins.contract import DetectorSpec
 from oodd_eval.plugins.discovery import Offer, discover, offer_of
@@ -27,17 +26,18 @@ def broken(plugins):
     return plugins.broken
 
 
-def test_built_in_detectors_are_an_entry_point_like_any_other():
+def test_an_installed_plugin_is_found_with_its_origin_beside_those_that_are_built_in(
+    monkeypatch, tmp_path
+):
+    install(monkeypatch, tmp_path, "extra", OFFER.format(name="extra"), version="2.5")
     plugins = discover()
+    offer = plugins.offer("extra")
+    assert (offer.origin, offer.plugin, offer.module) == ("oodd-extra 2.5", "extra", "oodd_extra")
     assert set(plugins.offers) >= BUILT_IN
     offer = plugins.offer("clock")
     assert (offer.plugin, offer.distribution) == ("trivial", "oodd-eval")
-
-
-def test_an_installed_plugin_is_found_with_its_origin(monkeypatch, tmp_path):
-    install(monkeypatch, tmp_path, "extra", OFFER.format(name="extra"), version="2.5")
-    offer = discover().offer("extra")
-    assert (offer.origin, offer.plugin, offer.module) == ("oodd-extra 2.5", "extra", "oodd_extra")
+    monkeypatch.setenv("OODD_EVAL_PLUGINS", "extra")
+    assert set(discover().offers) == {"extra", *BUILT_IN}
 
 
 @pytest.mark.parametrize(
@@ -108,16 +108,6 @@ def test_broken_plugins_are_reported_when_they_are_found(monkeypatch, tmp_path):
     assert heard == ["aaa", "zzz", plugins.broken[-1].plugin]
 
 
-def test_a_broken_plugin_is_named_on_standard_error(monkeypatch, tmp_path, capsys):
-    install(monkeypatch, tmp_path, "mine", "import no_such_module")
-    arguments = ["run", "--env", "cartpole", "--collect-only", "--output", str(tmp_path / "out")]
-    assert main([*arguments, "--detector", "mine"]) == 4
-    err = capsys.readouterr().err
-    assert "plug-in 'mine' of oodd-mine is broken: ModuleNotFoundError" in err
-    assert main([*arguments, "--detector", "clock"]) == 0
-    assert capsys.readouterr().err == ""
-
-
 def test_nothing_of_a_failed_plugin_stays(monkeypatch, tmp_path):
     code = "@hookimpl\ndef oodd_detectors(): return [*offer(fine=Good), *offer(clock=Good)]"
     install(monkeypatch, tmp_path, "half", code)
@@ -127,14 +117,21 @@ def test_nothing_of_a_failed_plugin_stays(monkeypatch, tmp_path):
     assert "half" not in plugins.loaded
 
 
-def test_a_detector_offered_twice_names_both_distributions(monkeypatch, tmp_path):
-    install(monkeypatch, tmp_path / "a", "one", OFFER.format(name="same"))
-    install(monkeypatch, tmp_path / "b", "two", OFFER.format(name="same"))
+@pytest.mark.parametrize(
+    ("names", "detector", "parts"),
+    [
+        (["one", "two"], "same", ["'same'", "'one' of oodd-one", "'two' of oodd-two"]),
+        (["trivial"], "mine", ["oodd-eval has a plug-in of the same name"]),
+    ],
+)
+def test_what_is_offered_twice_names_both_distributions(
+    monkeypatch, tmp_path, names, detector, parts
+):
+    for name in names:
+        install(monkeypatch, tmp_path / name, name, OFFER.format(name=detector))
     (found,) = broken(discover())
-    assert (
-        "'same' is offered twice, by plug-in 'one' of oodd-one and by plug-in 'two' of oodd-two"
-        in (found.reason)
-    )
+    assert found.distribution == f"oodd-{names[-1]}"
+    assert all(part in found.reason for part in parts)
 
 
 @pytest.mark.parametrize("name", ["aardvark", "clock"])
@@ -143,19 +140,6 @@ def test_no_other_distribution_takes_a_built_in_name(monkeypatch, tmp_path, name
     plugins = discover()
     assert plugins.offer("clock").spec.factory is Clock
     assert [b.plugin for b in broken(plugins)] == [name]
-
-
-def test_two_plugins_of_one_name_are_an_error_naming_the_other(monkeypatch, tmp_path):
-    install(monkeypatch, tmp_path, "trivial", OFFER.format(name="mine"))
-    (found,) = broken(discover())
-    assert found.distribution == "oodd-trivial"
-    assert "oodd-eval has a plug-in of the same name: uninstall one of them" in found.reason
-
-
-def test_the_environment_variable_restricts(monkeypatch, tmp_path):
-    install(monkeypatch, tmp_path, "extra", OFFER.format(name="extra"))
-    monkeypatch.setenv("OODD_EVAL_PLUGINS", "extra")
-    assert set(discover().offers) == {"extra", *BUILT_IN}
 
 
 @pytest.mark.parametrize("arguments", [{"disabled": ["nosuch"]}, {"only": ["nosuch"]}])
@@ -190,6 +174,10 @@ def test_parameters_are_defaults_and_overrides():
     assert list(found.items()) == [("kind", "a"), ("members", 2), ("rate", None)]
     assert resolve_parameters("x", None, {"any": 1}, others=True) == {"any": 1}
     assert parameters_of(None) == {}
+    values = {"size": 3, "kind": "a", "rate": None}
+    declared = parameters_of(declared_by(values))
+    assert {name: p.default for name, p in declared.items()} == values
+    assert resolve_parameters("x", declared_by(values), values) == values
 
 
 @pytest.mark.parametrize(
@@ -206,10 +194,3 @@ def test_parameters_are_defaults_and_overrides():
 def test_a_value_of_another_kind_or_out_of_bounds_is_refused(given, expected):
     with pytest.raises(UsageError, match=f"of x is .*expected {expected}"):
         resolve_parameters("x", Known, given)
-
-
-def test_parameters_known_at_run_time_are_declared_by_their_defaults():
-    values = {"size": 3, "kind": "a", "rate": None}
-    declared = parameters_of(declared_by(values))
-    assert {name: p.default for name, p in declared.items()} == values
-    assert resolve_parameters("x", declared_by(values), values) == values

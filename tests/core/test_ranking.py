@@ -113,21 +113,17 @@ def test_interval_of_a_difference_is_the_paired_one():
     assert (other.difference, other.low, other.high) == (-one.difference, -one.high, -one.low)
 
 
-@pytest.mark.parametrize(("n", "environments"), [(10, 1), (30, 1), (10, 4)])
+@pytest.mark.parametrize(("n", "environments"), [(10, 1), (10, 4)])
 def test_equal_detectors_are_called_different_in_one_table_of_twenty(n, environments):
     rng = np.random.default_rng(5)
     tables, wrong = 200, 0
     for _ in range(tables):
         episodes = {f"e{e}": rng.beta(4, 2, size=n) for e in range(environments)}
         rows = {
-            f"d{d}": {
-                0: {
-                    (e, "iid"): mean_of(0.6 * base + 0.4 * rng.beta(3, 1.5, size=n))
-                    for e, base in episodes.items()
-                }
-            }
+            f"d{d}": {0: {(e, "iid"): mean_of(0.6 * base + 0.4 * rng.beta(3, 1.5, size=n))
+                          for e, base in episodes.items()}}
             for d in range(4)
-        }
+        }  # fmt: skip
         wrong += any(c.better for c in rank(rows, resamples=1000).comparisons)
     # 5 % expected; 17 or more of 200 would come by chance in 3 of 100 suites at most.
     assert wrong / tables <= 0.08
@@ -163,19 +159,18 @@ def test_tie_groups_are_the_largest_sets_without_a_significant_pair(size, pairs)
     assert set(tie_groups(names, apart)) == largest
 
 
-def test_one_row_or_none_has_nothing_to_compare_with():
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ([0.5, 0.6, 0.7], "b has 3 test trajectories in ant/iid, expected 2"),
+        ([NAN, NAN], "b has no value in ant/iid"),
+    ],
+)
+def test_rows_of_other_test_seeds_and_undefined_cells_are_refused(values, message):
+    with pytest.raises(ResultsError, match=message):
+        rank({"a": row([0.5, 0.6]), "b": row(values)})
     assert rank({"a": row([0.5, 0.6])}).ranks == {"a": 1}
     assert rank({}).ranks == {}
-
-
-def test_rows_of_other_test_seeds_are_refused():
-    with pytest.raises(ResultsError, match="b has 3 test trajectories in ant/iid, expected 2"):
-        rank({"a": row([0.5, 0.6]), "b": row([0.5, 0.6, 0.7])})
-
-
-def test_a_row_with_an_undefined_cell_is_refused():
-    with pytest.raises(ResultsError, match="b has no value in ant/iid"):
-        rank({"a": row([0.5, 0.6]), "b": row([NAN, NAN])})
 
 
 def test_win_rates_count_equal_values_one_half():

@@ -5,7 +5,7 @@ import json
 import tomllib
 from pathlib import Path
 
-import minari
+import h5py
 import numpy as np
 import pytest
 import yaml
@@ -71,17 +71,27 @@ def logs(tmp_path):
     return make_log_split(tmp_path / "arm", FACTS, anomalies={"slip": SLIPS, "leak": [()] * 2})
 
 
-def test_parts_of_logs_have_rows_intervals_and_outcomes(logs):
+def test_parts_of_logs_have_rows_intervals_outcomes_and_tasks(logs, tmp_path):
     rows = {row[0]: row[1:] for row in log_rows(load_split(logs).environment("arm"))}
     assert list(rows) == ["train", "calibration", "test/nominal", "test/leak", "test/slip"]
     assert rows["train"] == ["6", "", "366", "60..62", "", "", "", ""]
     # 15 + 20 + 12 rows of the three episodes with intervals, which have 60 + 61 + 62.
     assert rows["test/slip"] == ["4", "", "243", "60..62", "4", "47 (26%)", "1", ""]
     assert rows["test/leak"] == ["2", "", "121", "60..61", "0", "", "2", ""]
+    parts = log_parts()
+    parts["train"] = [
+        dataclasses.replace(episode, task=f"task {i % 2}")
+        for i, episode in enumerate(parts["train"])
+    ]
+    told = log_rows(load_split(write_log_split(tmp_path / "tasks", parts)).environment("arm"))
+    assert [row[2] for row in told] == ["2", "", "", ""]
 
 
-def test_the_description_of_logs_says_where_they_are_from_and_how_rows_are_meant(logs):
+def test_the_description_of_logs_says_what_is_known_of_them(logs, tmp_path):
     text = describe(load_split(logs))
+    plain = describe(load_split(make_log_split(tmp_path / "plain")))
+    for nothing in ("source", "licence", "rate:", "baseline", "offsets", "outcome only"):
+        assert nothing not in plain
     for line in (
         "6 training, 40 calibration and 8 nominal test episodes; imported",
         "source: https://example.org/arm",
@@ -95,12 +105,6 @@ def test_the_description_of_logs_says_where_they_are_from_and_how_rows_are_meant
     assert "first 20 rows" in text
     assert "clock:" in text
     for nothing in ("Table 2", "±", "return", "policy", "arm arm", "redraws", "tasks"):
-        assert nothing not in text
-
-
-def test_facts_that_a_recipe_leaves_out_are_left_out(tmp_path):
-    text = describe(load_split(make_log_split(tmp_path / "arm")))
-    for nothing in ("source", "licence", "rate:", "baseline", "offsets", "outcome only"):
         assert nothing not in text
 
 
@@ -125,27 +129,11 @@ def test_pairs_of_logs_have_onsets_and_no_returns(tmp_path):
         assert nothing not in text
 
 
-def test_tasks_and_rewards_are_told_where_there_are_any(tmp_path):
-    parts = log_parts()
-    parts["train"] = [
-        dataclasses.replace(episode, task=f"task {i % 2}")
-        for i, episode in enumerate(parts["train"])
-    ]
-    rows = log_rows(load_split(write_log_split(tmp_path / "arm", parts)).environment("arm"))
-    assert [row[2] for row in rows] == ["2", "", "", ""]
-
-
-def test_the_command_examines_the_promise_of_logs(logs, capsys):
+def test_the_command_examines_the_promise_of_logs_and_their_labels(logs, capsys):
     assert main(["data", "info", str(logs)]) == 0
-    text = capsys.readouterr().out
-    assert "40 calibration episodes" in text
+    assert "40 calibration episodes" in capsys.readouterr().out
     assert main(["data", "verify", str(logs)]) == 0
     assert "6 of 6 groups" in capsys.readouterr().out
-
-
-def test_a_changed_label_is_no_longer_verified(logs, capsys):
-    import h5py
-
     with h5py.File(logs / "arm.h5", "r+") as file:
         file["test/slip/intervals"][0] = (31, 45)
     assert main(["data", "verify", str(logs)]) == 1
@@ -163,21 +151,6 @@ def test_imported_environments_are_listed_and_described(logs, capsys, monkeypatc
         assert text in page
     assert main(["info", "aarm"]) == 4
     assert "did you mean 'arm'" in capsys.readouterr().err
-
-
-def test_labels_of_logs_are_metadata_of_an_export(logs, tmp_path, monkeypatch):
-    root = tmp_path / "datasets"
-    assert main(["data", "export", str(logs), "--format", "minari", "--output", str(root)]) == 0
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(root))
-    dataset = minari.load_dataset("oodd/arm/arm/test-slip-v0")
-    metadata = list(dataset.storage.get_episode_metadata(range(4)))
-    assert [json.loads(m["intervals"]) for m in metadata] == [[[30, 45]], [[10, 20], [30, 40]],
-                                                              [[-1, 12]], []]  # fmt: skip
-    assert {m["anomaly"] for m in metadata} == {"slip"}
-    episode = load_split(logs).environment("arm").labelled("slip")[1]
-    assert (next(dataset.iterate_episodes([1])).observations == episode.observations).all()
-    facts = json.loads((root / "oodd/arm/arm/train-v0/data/metadata.json").read_text())["logs"]
-    assert (facts["licence"], facts["offsets"]) == ("CC BY 4.0", [5.4e6, 0, 0])
 
 
 def test_licence_is_the_same_everywhere():

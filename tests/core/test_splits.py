@@ -52,9 +52,6 @@ def test_what_was_written_is_read_back(tiny_split):
         np.testing.assert_array_equal(rows, wrote["observations"].astype("f4"))
         actions = np.concatenate([x.actions for x in found])
         np.testing.assert_array_equal(actions, wrote["actions"].astype("f4"))
-
-
-def test_lengths_returns_and_sizes_of_the_parts(tiny_split):
     data = load_split(tiny_split).environment("cartpole")
     assert [len(p) for p in (data.train, data.calibration, data.twins)] == [6, 4, 3]
     assert data.twins.lengths.tolist() == [60, 61, 62]
@@ -62,6 +59,10 @@ def test_lengths_returns_and_sizes_of_the_parts(tiny_split):
     assert data.anomalous("iid").returns.tolist() == [30.0, 30.5, 31.0]
     assert data.twins.terminated.tolist() == [False] * 3
     assert data.anomalies == TABLE1
+    with pytest.raises(UnknownNameError, match="did you mean 'hopper'"):
+        load_split(tiny_split).environment("hoper")
+    with pytest.raises(UnknownNameError, match=r"of cartpole 'idd': did you mean 'iid'"):
+        data.anomalous("idd")
 
 
 @pytest.mark.parametrize(
@@ -187,14 +188,6 @@ def test_a_rebuilt_published_split_is_labelled_as_another(data_home, tmp_path, m
     assert rebuilt.name == f"standard@{rebuilt.digest[:8]}"
     monkeypatch.setattr(splits, "published_digests", lambda: {"standard": rebuilt.digest})
     assert rebuilt.name == "standard"
-
-
-def test_unknown_environment_and_anomaly_are_named(tiny_split):
-    split = load_split(tiny_split)
-    with pytest.raises(UnknownNameError, match="did you mean 'hopper'"):
-        split.environment("hoper")
-    with pytest.raises(UnknownNameError, match=r"of hopper 'idd': did you mean 'iid'"):
-        split.environment("hopper").anomalous("idd")
 
 
 # Damage

@@ -15,8 +15,6 @@ import pytest
 from helpers_plugins import HEADER, install
 from helpers_split import make_split
 from helpers_spy import SPY, Findings, vectors
-from hypothesis import given
-from hypothesis import strategies as st
 
 from oodd_eval import evaluate, load_split
 from oodd_eval.data.facts import TABLE1
@@ -220,15 +218,3 @@ def test_trajectories_arrive_whole_and_in_one_form(mini):
     ]
     forms = {str(form) for when in ("fit", "score") for *_, form in mini.arrived(when)}
     assert len(forms) == 1, forms
-
-
-@given(st.dictionaries(st.text(), st.integers(0, 50)), st.integers(1, 20))
-def test_groups_have_one_part_and_one_size_and_miss_nothing(sizes, twins):
-    sizes["test/nominal"] = twins
-    found = unit.groups(sizes)
-    assert [tuple(place) for group in found for place in group] == [
-        (part, i) for part, n in sizes.items() for i in range(n)
-    ]
-    assert all(len({place.part for place in group}) == 1 for group in found)
-    assert all(0 < len(group) <= twins for group in found)
-    assert sum(len(group) < twins for group in found) <= len(sizes)
