@@ -79,16 +79,19 @@ def run_rows(detector, split, output=None, *, streamed=True, sandboxed=False, **
     return record, scores and scores.parts, sets
 
 
+QUICK = [(name, {}) for name in ("mewma", "persistence", "clock", "random")]
+OTHERS = [
+    *((name, {}) for name in ("mahalanobis", "range", "comb", "pca", "knn", "deedee")),
+    ("rf", {"trees": 3}),
+    *((name, {"updates": 3}) for name in ("pe", "pe-a", "npn", "riqn", "rnd", "paano")),
+    *((name, {"updates": 3}) for name in ("rpt-a", "logpzo", "logpzo-a", "wm-kl-a")),
+]
+
+
 @pytest.mark.parametrize(
     ("detector", "parameters"),
-    [
-        *((name, {}) for name in ("mewma", "mahalanobis", "range", "persistence", "clock", "comb")),
-        ("random", {}), ("rf", {"trees": 3}),
-        *((name, {}) for name in ("pca", "knn", "deedee")),
-        *((name, {"updates": 3}) for name in ("pe", "pe-a", "npn", "riqn", "rnd", "paano")),
-        *((name, {"updates": 3}) for name in ("rpt-a", "logpzo", "logpzo-a", "wm-kl-a")),
-    ],
-)  # fmt: skip
+    [*QUICK, *(pytest.param(*other, marks=pytest.mark.slow) for other in OTHERS)],
+)
 def test_scores_row_by_row_are_those_of_batches(tiny_split, tmp_path, detector, parameters):
     batch, expected, _ = run_rows(detector, tiny_split, tmp_path, streamed=False, **parameters)
     record, parts, _ = run_rows(detector, tiny_split, tmp_path, **parameters)
