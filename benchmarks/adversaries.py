@@ -155,7 +155,7 @@ def gains(board, name):
     for metric in METRICS:
         for environment in (None, *board.environments):
             mine = values(board, name, metric, environment)
-            base = values(board, adversaries.base_of(name), metric, environment)
+            base = values(board, adversaries.BASE, metric, environment)
             if not mine.state and mine.value > base.high and mine.low > base.value:
                 where = environment or "all"
                 places.append(f"{metric} {where}: {mine.value:.3f}, honest {base.value:.3f}")
