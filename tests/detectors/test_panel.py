@@ -113,18 +113,22 @@ def test_rows_beyond_the_first_ones_teach_nothing():
     np.testing.assert_array_equal(*after)
 
 
-def test_variance_of_coefficients_between_episodes_is_recovered():
-    rng = np.random.default_rng(2)
-    gains = 1.0 + 0.3 * rng.normal(size=60)
-    episodes = [driven(seed, gain) for seed, gain in enumerate(gains)]
-    plain = [
+def plain_episodes(gains, seed=0):
+    episodes = [driven(seed + i, gain) for i, gain in enumerate(gains)]
+    return [
         StandardEpisode(x.observations.astype(float), x.actions.astype(float)) for x in episodes
     ]
-    forecast = LinearForecast.fit(plain, 1, 1e-6, varies=True)
+
+
+def test_variance_of_coefficients_between_episodes_is_recovered():
+    gains = 1.0 + 0.3 * np.random.default_rng(2).normal(size=60)
+    forecast = LinearForecast.fit(plain_episodes(gains), 1, 1e-6, varies=True)
     assert forecast.scale[0] == pytest.approx(0.05, rel=0.05)
     # The newest action is the fourth regressor; its prior is in units of the errors' variance.
     assert np.sqrt(forecast.prior[3, 3]) * 0.05 == pytest.approx(gains.std(), rel=0.1)
     assert forecast.coefficients[3, 0] == pytest.approx(gains.mean(), abs=0.02)
+    equal = make_panel("panel-a", forecast="linear").fit([driven(seed, 1.0) for seed in range(24)])
+    assert equal.forecast_.prior.shape == (0, 0)
 
 
 def test_the_chosen_ridge_is_small_for_an_exact_system_and_large_for_noise():
@@ -139,13 +143,6 @@ def test_the_chosen_ridge_is_small_for_an_exact_system_and_large_for_noise():
 
 
 # Constants of an episode
-
-
-def plain_episodes(gains, seed=0):
-    episodes = [driven(seed + i, gain) for i, gain in enumerate(gains)]
-    return [
-        StandardEpisode(x.observations.astype(float), x.actions.astype(float)) for x in episodes
-    ]
 
 
 def random_charts(rank, seed=14, sensors=2, actions=1):
@@ -350,14 +347,6 @@ def test_a_tail_of_few_values_is_drawn_to_the_common_scale():
 # The panel
 
 
-def test_three_hundred_rows_of_eight_sensors_are_enough():
-    panel = make_panel().fit([log_of(1)])
-    test = log_of(2)
-    before, after = panel.score(test), panel.score(with_step(test, 150, 300, 4.0))
-    np.testing.assert_array_equal(after[:150], before[:150])
-    assert np.median(after[155:]) > np.nanmax(before)
-
-
 def test_ten_episodes_name_the_sensor_and_the_onset(panel):
     faulty = with_step(log_of(50), 200, 300, 3.0, sensor=5)
     shares, onsets = panel.explain(faulty)
@@ -386,17 +375,6 @@ def test_members_say_what_they_are_surprised_by(panel):
     typical = dict(zip(panel.voices, np.median(surprises[170:], axis=0), strict=True))
     # Errors of alternating sign cancel in sums and in means, and not in squares.
     assert typical["energy"] > 1.5 * max(typical["sums"], typical["level"])
-
-
-def test_streamed_scores_and_explanations_are_those_of_the_whole_episode(panel):
-    faulty = with_step(log_of(52, rows=120), 60, 120, 3.0)
-    scores, (shares, onsets) = panel.score(faulty), panel.explain(faulty)
-    panel.reset()
-    for t, row in enumerate(faulty.observations):
-        np.testing.assert_array_equal(panel.update(row), scores[t])
-        share, onset = panel.explain_last()
-        np.testing.assert_array_equal(share, shares[t])
-        assert onset == onsets[t]
 
 
 def test_a_level_of_the_day_is_taken_out_with_baseline_rows():
@@ -474,12 +452,6 @@ def test_a_sensor_that_always_jumps_hides_no_fault_of_the_others():
     assert (panel.explain(faulty)[0][175:].argmax(axis=1) == 0).mean() > 0.8
 
 
-def test_equal_episodes_share_their_coefficients():
-    nominal = [driven(seed, 1.0) for seed in range(24)]
-    panel = make_panel("panel-a", forecast="linear").fit(nominal)
-    assert panel.forecast_.prior.shape == (0, 0)
-
-
 def test_more_sensors_than_components_are_forecast_by_components():
     rng = np.random.default_rng(12)
     mixing = rng.normal(size=(3, 100))
@@ -515,14 +487,10 @@ def test_the_ensemble_is_a_voice_where_it_is_asked_for(monkeypatch):
     assert not np.array_equal(alone.score(test), scores, equal_nan=True)
 
 
-def test_a_state_of_other_settings_is_refused(panel):
-    with pytest.raises(FittedStateError):
-        make_panel(baseline=5).restore(panel.state())
-    with pytest.raises(FittedStateError):
-        make_panel("panel-a").restore(panel.state())
-
-
-def test_bad_arguments_are_refused():
+def test_states_of_other_settings_and_bad_arguments_are_refused(panel):
+    for other in (make_panel(baseline=5), make_panel("panel-a")):
+        with pytest.raises(FittedStateError):
+            other.restore(panel.state())
     with pytest.raises(UsageError, match="forecast"):
         make_panel(forecast="cubic")
     with pytest.raises(TrajectoryError, match="at least one that long"):

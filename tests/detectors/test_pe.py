@@ -464,13 +464,6 @@ def test_each_episode_is_judged_by_the_member_that_has_not_seen_it(fitted):
         np.testing.assert_array_equal(found.residuals, deviance(residual[fold], tail[fold]))
 
 
-def test_few_episodes_are_cut_into_blocks_of_every_fold(fitted):
-    pieces, folds = fitted["pe-a"].pieces(NOMINAL[:2])
-    assert folds == [0, 1, 2, 0, 1, 2]
-    steps = [p.known.steps for p in pieces[:3]]
-    np.testing.assert_array_equal(np.concatenate(steps), np.arange(149))
-
-
 @pytest.mark.parametrize(("members", "count"), [(1, 3), (2, 4), (3, 6)])
 def test_half_of_many_episodes_are_judged_and_each_member_has_seen_the_others(members, count):
     nominal = [episode(seed) for seed in range(30)]
@@ -482,7 +475,11 @@ def test_half_of_many_episodes_are_judged_and_each_member_has_seen_the_others(me
     assert [j is not None for j in judged] == [fold < members for fold in folds]
 
 
-def test_episodes_beyond_those_that_charts_need_are_in_no_fold(fitted, monkeypatch):
+def test_folds_are_blocks_of_few_episodes_and_no_more_than_charts_need(fitted, monkeypatch):
+    pieces, folds = fitted["pe-a"].pieces(NOMINAL[:2])
+    assert folds == [0, 1, 2, 0, 1, 2]
+    steps = [p.known.steps for p in pieces[:3]]
+    np.testing.assert_array_equal(np.concatenate(steps), np.arange(149))
     monkeypatch.setattr("oodd_pe.detector.CHARTED", 149 * 4)
     pieces, folds = fitted["pe-a"].pieces(NOMINAL[:7])
     assert folds == [0, 1, 2, 0, -1, -1, -1]
@@ -498,12 +495,15 @@ def walk(seed, rows, sensors):
     return Trajectory(x, random.normal(size=(rows - 1, 2)))
 
 
-@pytest.mark.parametrize("members", [1, 3, 4])
-@pytest.mark.parametrize("horizon", [1, 3])
 @pytest.mark.parametrize(
-    "nominal",
-    [[walk(s, 120, 3) for s in range(3)], [walk(0, 300, 8)], [walk(0, 5, 2)]],
-    ids=["3 episodes", "1 episode of 300 rows", "1 episode of 5 rows"],
+    ("nominal", "horizon", "members"),
+    [
+        ([walk(s, 120, 3) for s in range(3)], 1, 3),
+        ([walk(s, 120, 3) for s in range(3)], 3, 4),
+        ([walk(0, 300, 8)], 1, 1),
+        ([walk(0, 5, 2)], 3, 3),
+        ([walk(0, 5, 2)], 1, 4),
+    ],
 )
 def test_few_data_are_enough(nominal, horizon, members):
     settings = {"updates": 20, "width": 8, "batch": 16, "members": members, "horizon": horizon}

@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("gymnasium", reason="needs the extra gym")
 import gymnasium
-from oodd_worlds import make_gym_oracle, oodd_detectors
+from oodd_worlds import make_gym_oracle
 from oodd_worlds.classic import (
     AcrobotEquations,
     CartPoleEquations,
@@ -222,26 +222,19 @@ def test_innovations_of_nominal_rows_are_white_and_of_unit_size():
 
 
 @pytest.mark.parametrize("name", ENVIRONMENTS.values())
-def test_scores_row_by_row_are_those_of_the_episode_and_of_its_beginning(mini, fitted, name):
+def test_rows_one_by_one_and_a_restored_fit_have_the_same_scores(mini, fitted, name):
     detector, (_, (x, _)) = fitted[name], mini[name]
     scores = detector.score(x)
     assert np.isnan(scores).tolist() == [True] + [False] * (len(x) - 1)
-    detector.reset()
-    actions = [None, *x.actions]
-    streamed = [detector.update(row, a) for row, a in zip(x.observations, actions, strict=True)]
-    np.testing.assert_array_equal(streamed, scores)
     np.testing.assert_array_equal(detector.score(x[:21]), scores[:21])
-
-
-@pytest.mark.parametrize("name", ENVIRONMENTS.values())
-def test_a_state_gives_the_same_scores(mini, fitted, name):
-    detector, (_, (x, _)) = fitted[name], mini[name]
     other = make_gym_oracle()
     with pytest.raises(NotFittedError):
         other.score(x)
     packed = pack(detector.state())
     other.restore(packed.state())
-    np.testing.assert_array_equal(other.score(x), detector.score(x))
+    actions = [None, *x.actions]
+    streamed = [other.update(row, a) for row, a in zip(x.observations, actions, strict=True)]
+    np.testing.assert_array_equal(streamed, scores)
     with pytest.raises(FittedStateError, match=r"\(\d, 9\), expected one of"):
         make_gym_oracle().restore({**packed.state(), "actions": np.array(9)})
 
@@ -275,8 +268,3 @@ def test_what_it_has_no_equations_of_is_refused():
         make_gym_oracle().fit([x])
     with pytest.raises(NotImplementedError, match="horizon 2: use 1"):
         make_gym_oracle(horizon=2)
-
-
-def test_it_is_declared_as_an_oracle_and_needs_no_simulator():
-    (spec,) = (s for s in oodd_detectors() if s.name == "oracle-gym")
-    assert (spec.training, spec.alarm, spec.requires) == ("oracle", "score", ())

@@ -12,7 +12,7 @@ from helpers_own import forget_own
 from oodd_recording.environments import make
 from oodd_recording.policies import load_policy
 from oodd_recording.record import Setup, record_anomalous
-from oodd_worlds import make_oracle, oodd_anomalies, oodd_detectors, oodd_environments
+from oodd_worlds import make_oracle, oodd_anomalies, oodd_environments
 from oodd_worlds.facts import read_world
 from oodd_worlds.oracles import (
     CLIP,
@@ -57,6 +57,22 @@ def registered_worlds():
 def episodes(world, count, first=SEED):
     setup = Setup(world, load_policy(world))
     return [setup.record(first + i) for i in range(count)]
+
+
+@pytest.fixture(scope="module")
+def detectors():
+    """A fit of each world, and three nominal episodes that it has not seen."""
+    register([*oodd_environments(), *oodd_anomalies()])
+    made = {}
+    for world in WORLDS:
+        train, fresh = (
+            [episode.trajectory for episode in episodes(world, 3, first)]
+            for first in (SEED + 10, SEED + 20)
+        )
+        detector = make_oracle()
+        detector.fit(train)
+        made[world] = detector, fresh
+    return made
 
 
 def drawn(world, seed):
@@ -241,31 +257,27 @@ def test_standards_are_of_each_episodes_largest_charts_and_the_farthest_chart_co
 
 
 @pytest.mark.parametrize("world", WORLDS)
-def test_rows_one_by_one_and_a_restored_fit_have_the_same_bits(world):
-    nominal = [episode.trajectory for episode in episodes(world, 3)]
-    detector = make_oracle()
-    detector.fit(nominal[:2])
+def test_rows_one_by_one_and_a_restored_fit_have_the_same_bits(world, detectors):
+    detector, nominal = detectors[world]
     trajectory = nominal[2][:60]
     scores = detector.score(trajectory)
     other = make_oracle()
     other.restore(detector.state())
-    for each in (detector, other):
-        for _ in range(2):
-            each.reset()
-            streamed = [each.update(trajectory.observations[0])]
-            pairs = zip(trajectory.observations[1:], trajectory.actions, strict=True)
-            streamed += [each.update(*pair) for pair in pairs]
-            np.testing.assert_array_equal(streamed, scores)
+    other.reset()
+    streamed = [other.update(trajectory.observations[0])]
+    pairs = zip(trajectory.observations[1:], trajectory.actions, strict=True)
+    streamed += [other.update(*pair) for pair in pairs]
+    np.testing.assert_array_equal(streamed, scores)
     np.testing.assert_array_equal(other.score(nominal[2])[:60], scores)
     assert math.isnan(scores[0])
     assert np.isfinite(scores[1:]).all()
 
 
 @pytest.mark.parametrize(("world", "kind", "strength"), KINDS)
-def test_a_fault_that_costs_little_scores_above_its_twin_in_nearly_all_rows(world, kind, strength):
-    train = [episode.trajectory for episode in episodes(world, 3, SEED + 10)]
-    detector = make_oracle()
-    detector.fit(train)
+def test_a_fault_that_costs_little_scores_above_its_twin_in_nearly_all_rows(
+    world, kind, strength, detectors
+):
+    detector, _ = detectors[world]
     (twin,) = episodes(world, 1)
     episode = record_anomalous(Setup(world, load_policy(world)), kind, strength, twin)
     scores, reference = (detector.score(e.trajectory) for e in (episode, twin))
@@ -273,17 +285,15 @@ def test_a_fault_that_costs_little_scores_above_its_twin_in_nearly_all_rows(worl
     assert auc(scores[episode.effect :], reference[episode.effect :]) > 0.9
 
 
-def test_a_fault_of_any_size_leaves_scores_finite():
+@pytest.mark.parametrize("world", WORLDS)
+def test_a_fault_of_any_size_leaves_scores_finite(world, detectors):
     """Readings far beyond what a body can do, and back: numbers stay numbers, and high."""
-    for world in WORLDS:
-        nominal = [episode.trajectory for episode in episodes(world, 2)]
-        detector = make_oracle()
-        detector.fit(nominal)
-        rows = nominal[0].observations.copy()
-        rows[100:110, : MODELS[world].measured] *= -1000
-        scores = detector.score(Trajectory(rows, nominal[0].actions))
-        assert np.isfinite(scores[1:]).all(), world
-        assert scores[100:110].min() > np.nanmax(detector.score(nominal[0])), world
+    detector, nominal = detectors[world]
+    rows = nominal[0].observations.copy()
+    rows[100:110, : MODELS[world].measured] *= -1000
+    scores = detector.score(Trajectory(rows, nominal[0].actions))
+    assert np.isfinite(scores[1:]).all()
+    assert scores[100:110].min() > np.nanmax(detector.score(nominal[0]))
 
 
 def test_worlds_are_told_by_their_columns_and_others_are_refused():
@@ -297,19 +307,11 @@ def test_worlds_are_told_by_their_columns_and_others_are_refused():
         make_oracle().fit([])
 
 
-def test_a_fit_of_another_shape_is_refused():
-    detector = make_oracle()
-    detector.fit([episode.trajectory for episode in episodes("tank", 2)])
-    state = detector.state()
+def test_a_fit_of_another_shape_is_refused(detectors):
+    state = detectors["tank"][0].state()
     for changes in ({"actions": np.array(5)}, {"chart_spread": np.zeros(2 * len(WEIGHTS))}):
         with pytest.raises(FittedStateError):
             make_oracle().restore(state | changes)
-
-
-def test_the_oracle_declares_that_it_has_the_equations():
-    (spec,) = (s for s in oodd_detectors() if s.name == "oracle")
-    assert (spec.training, spec.alarm) == ("oracle", "score")
-    assert spec.deterministic
 
 
 # The ceiling
