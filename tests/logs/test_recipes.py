@@ -26,21 +26,21 @@ SETS = {
              {"valve1": [[(100, 250)]] * 3, "valve2": [[(100, 250)]]}),
     # Windows of 10 s: 5 of each flight without a failure, 4 before each of the two failures.
     # Rows are counted from the first one in which every sensor has spoken: the fifth.
-    "alfa": (20, (12, 18, 8), {"engine": 2 + 2},
+    "alfa": (20, (10, 20, 8), {"engine": 2 + 2},
              {"engine": [[(846 - 800, 200)], [(0, 200)], [(896 - 800, 200)], [(0, 186)]]}),
     # 800 rows in 12.784 s are 768 at 60 Hz: 25 windows each of two healthy runs. Of the 576 of the
     # faulty one, 15 windows have anomalous rows, the last one being shorter.
     "rosa": (60, (20, 30, 5), {"damping": 15}, {}),
     "tep": (1 / 180, (11, 17, 5), {"fault-05": 4}, {"fault-05": [[(0, 20)]] * 4}),
     # Tasks are shared out each for itself; lp3 is lp2 again and is left out.
-    "uci": (47.62, (26, 20, 19), {"collision": 4, "fr_collision": 3, "left_col": 3,
+    "uci": (47.62, (22, 24, 19), {"collision": 4, "fr_collision": 3, "left_col": 3,
                                   "obstruction": 5}, {"collision": [[(0, 15)]] * 4}),
     # Windows of 1200 rows; the variables are called by the number of their file.
     "cwru": (12000, (6, 4, 5), {"inner-race": 2, "ball": 2}, {"ball": [[(0, 1200)]] * 2}),
     # 157 windows of half a day, five of which have rows of each label.
     "nab": (1 / 300, (55, 41, 41), {"failure": 20}, {}),
     # Two pieces of 799 s, 39 windows each, some with a stop or a lost grip, none with both.
-    "ur3": (1, (30, 22, 22), {"protective-stop": 2, "grip-lost": 2},
+    "ur3": (1, (26, 30, 18), {"protective-stop": 2, "grip-lost": 2},
             {"protective-stop": [[(10, 14)], [(0, 11)]]}),
     "lerobot": (30, (4, 4, 2), {}, {}),
     # Failures are known by their outcome alone; tasks are shared out each for itself.
