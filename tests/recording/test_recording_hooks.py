@@ -1,9 +1,7 @@
 """Hooks of recording with known answers: roles, noise, memory, units, schedules, digests."""
 
-import json
 import subprocess
 import sys
-import textwrap
 from importlib.metadata import version
 from types import SimpleNamespace
 
@@ -198,28 +196,20 @@ def drawn(kind, strength):
     return make_fault(kind, strength, simulator, np.random.default_rng(1)), simulator
 
 
-def volts(value):
-    return np.array([value], np.float32)
+def test_strengths_of_commands_are_shares_of_half_the_range_and_stay_within(cistern):
+    def volts(value):
+        return np.array([value], np.float32)
 
-
-def test_a_bias_is_a_share_of_half_the_range_and_stays_within(cistern):
     fault, simulator = drawn("bias", 0.25)
     sign = fault.parameters["direction"]
     assert fault.command(volts(3.0), simulator) == 3.0 + sign * 0.25 * 4
     assert fault.command(volts(0.5 if sign < 0 else 7.5), simulator) == (0 if sign < 0 else 8)
-
-
-def test_noise_of_actions_is_a_share_of_half_the_range_and_stays_within(cistern):
     fault, simulator = drawn("action-noise", 0.1)
     commands = np.array([fault.command(volts(4.0), simulator)[0] for _ in range(4000)])
     assert commands.std() == pytest.approx(0.1 * 4, rel=0.05)
     assert commands.mean() == pytest.approx(4.0, abs=0.03)
     at_the_end = np.array([fault.command(volts(8.0), simulator)[0] for _ in range(400)])
     assert at_the_end.max() == 8.0
-
-
-def test_wind_is_a_share_of_half_the_range_and_stays_within(cistern):
-    simulator = make("cistern")
     simulator.wind = -0.25
     assert simulator.command(volts(3.0)) == 2.0
     assert simulator.command(volts(0.5)) == 0.0
@@ -299,8 +289,16 @@ def nothing(strength, rng, simulator):
     return Fault({})
 
 
-def scheduled(rows=24, **schedule):
-    """Drive a fault for some rows of zeros; return it, and what came of commands and rows."""
+@pytest.mark.parametrize(
+    ("rows", "schedule", "shares", "begins", "ends"),
+    [
+        (24, {"ramp": 16}, [min(1, (k + 1) / 16) for k in range(24)], [0], []),
+        (24, {"lasts": 5}, [1] * 5 + [0] * 19, [0], [5]),
+        (12, {"pulses": (2, 3)}, [1, 1, 0, 0, 0] * 2 + [1, 1], [0, 5, 10], [2, 7]),
+        (10, {"ramp": 8, "lasts": 4}, [1 / 8, 2 / 8, 3 / 8, 4 / 8] + [0] * 6, [0], [4]),
+    ],
+)
+def test_faults_grow_end_and_come_back_by_their_rows(rows, schedule, shares, begins, ends):
     spec = AnomalySpec("noted", "sensor", "one", "1", 1.0, nothing, **schedule)
     inner = Noted()
     fault = Scheduled(inner, spec)
@@ -311,36 +309,10 @@ def scheduled(rows=24, **schedule):
         commands.append(fault.command(0, simulator))
         observed.append(float(fault.observe(np.zeros(1, np.float32), step)[0]))
     assert inner.draws == rows
-    return inner, commands, observed
-
-
-def test_a_ramp_grows_linearly_to_the_whole_strength():
-    inner, _, observed = scheduled(ramp=16)
-    assert inner.shares == [min(1, (k + 1) / 16) for k in range(24)]
-    assert observed == [8 * min(1, (k + 1) / 16) for k in range(24)]
-    assert (inner.begins, inner.ends) == ([0], [])
-
-
-def test_a_fault_that_lasts_some_rows_ends_once():
-    inner, commands, observed = scheduled(lasts=5)
-    assert commands == [1] * 5 + [0] * 19
-    assert observed == [8.0] * 5 + [0.0] * 19
-    assert (inner.begins, inner.ends) == ([0], [5])
-
-
-def test_pulses_begin_and_end_again_and_again():
-    inner, commands, observed = scheduled(rows=12, pulses=(2, 3))
-    on = [1, 1, 0, 0, 0] * 2 + [1, 1]
-    assert commands == on
-    assert observed == [8.0 * x for x in on]
-    assert inner.begins == [0, 5, 10]
-    assert inner.ends == [2, 7]
-
-
-def test_a_ramp_that_ends_falls_to_nothing():
-    inner, _, observed = scheduled(rows=10, ramp=8, lasts=4)
-    assert observed == [1.0, 2.0, 3.0, 4.0] + [0.0] * 6
-    assert inner.ends == [4]
+    assert observed == [8.0 * share for share in shares]
+    assert commands == [int(share > 0) for share in shares]
+    assert [s for s, on in zip(inner.shares, shares, strict=True) if on] == [s for s in shares if s]
+    assert (inner.begins, inner.ends) == (begins, ends)
 
 
 def setup_without_noise(cistern):
@@ -430,22 +402,17 @@ def package(monkeypatch, tmp_path):
     forget_own()
 
 
-def test_the_digest_is_of_the_whole_package(package):
+def test_the_digest_is_of_the_whole_package_but_for_caches_and_ladders(package):
     digests = [code_digest("packed", [])]
-    for name, text in (("helper.py", "GAIN = 2\n"), ("model/arm.xml", "<mujoco model='2'/>\n")):
-        (package / name).write_text(text)
-        digests.append(code_digest("packed", []))
-    (package / "model" / "leg.xml").write_text("<mujoco/>\n")
-    digests.append(code_digest("packed", []))
-    assert len(set(digests)) == 4
-
-
-def test_caches_and_what_calibration_writes_do_not_count(package):
-    before = code_digest("packed", [])
     (package / "__pycache__").mkdir(exist_ok=True)  # importing may have written it
     for name in ("__pycache__/helper.pyc", ".helper.py.swp", "ladder.json", "ladder.json.work"):
         (package / name).write_text("x")
-    assert code_digest("packed", []) == before
+    assert code_digest("packed", []) == digests[0]
+    for name, text in (("helper.py", "GAIN = 2\n"), ("model/arm.xml", "<mujoco model='2'/>\n"),
+                       ("model/leg.xml", "<mujoco/>\n")):  # fmt: skip
+        (package / name).write_text(text)
+        digests.append(code_digest("packed", []))
+    assert len(set(digests)) == 4
 
 
 def test_the_digest_does_not_depend_on_where_a_package_lies(package, monkeypatch):
@@ -490,42 +457,25 @@ def test_a_later_call_needs_no_package_of_an_earlier_one(cistern, monkeypatch, t
 # Simulators are imported where they record
 
 
-def loaded_after(code):
-    """Names of simulators that a process has imported after some code."""
-    program = textwrap.dedent(code) + textwrap.dedent("""
-        import json, sys
-        names = ("pybullet", "pybullet_envs_gymnasium", "Box2D", "mujoco")
-        print(json.dumps([name for name in names if name in sys.modules]))
-    """)
+@pytest.mark.parametrize(
+    ("package", "environment"), [("oodd_recording.benchmark", "cartpole"), ("oodd_worlds", "tank")]
+)
+def test_recording_imports_no_other_simulator(package, environment):
+    program = f"""
+import sys
+from oodd_eval.data.registry import register
+from {package} import oodd_anomalies, oodd_environments
+register([*oodd_environments(), *oodd_anomalies()])
+from oodd_recording.policies import load_policy
+from oodd_recording.record import record_nominal
+record_nominal("{environment}", 1, policy=load_policy("{environment}"), episode_cap=60)
+others = {{"pybullet", "pybullet_envs_gymnasium", "Box2D", "mujoco"}} & set(sys.modules)
+sys.exit(f"imported {{others}}" if others else 0)
+"""
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout.splitlines()[-1])
-
-
-def test_recording_cartpole_imports_no_other_simulator():
-    code = """
-        from oodd_eval.data.registry import register
-        from oodd_recording.benchmark import oodd_anomalies, oodd_environments
-        register([*oodd_environments(), *oodd_anomalies()])
-        from oodd_recording.policies import load_policy
-        from oodd_recording.record import record_nominal
-        record_nominal("cartpole", 1, policy=load_policy("cartpole"), episode_cap=60)
-    """
-    assert loaded_after(code) == []
-
-
-def test_recording_tanks_imports_no_mujoco():
-    code = """
-        from oodd_eval.data.registry import register
-        from oodd_worlds import oodd_anomalies, oodd_environments
-        register([*oodd_environments(), *oodd_anomalies()])
-        from oodd_recording.policies import load_policy
-        from oodd_recording.record import record_nominal
-        record_nominal("tank", 1, policy=load_policy("tank"), episode_cap=60)
-    """
-    assert loaded_after(code) == []
 
 
 def test_without_pybullet_the_extra_is_named(monkeypatch):
