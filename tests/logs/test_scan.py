@@ -355,46 +355,51 @@ def test_an_offset_that_float32_cannot_tell():
     assert (odd.episode.name, odd.suspects) == ("episode 3", ["speed"])
 
 
-def broken(fault):
-    episodes = [episode(x, f"e{i}", time=0.1 * np.arange(150)) for i, x in enumerate(logs())]
-    rows, time = episodes[6].observations, episodes[6].time
-    if fault == "missing":
-        rows[60:70, 1] = np.nan
-    elif fault == "missing now and then":
-        rows[60:90:3, 1] = np.nan
-    elif fault == "wild":
-        rows[60:70, 1] = 1e30
-    elif fault == "frozen":
-        rows[60:90, 1] = rows[60, 1]
-    elif fault == "repeated":
-        rows[60:90] = rows[60]
-    elif fault == "out of range":
-        rows[60:70, 1] = 900.0
-    elif fault == "gap":
-        time[60:] += 7.0
-    return episodes
+FAULTS = {
+    "missing": ("torque", "missing"),
+    "missing now and then": ("torque", "missing"),
+    "wild": ("torque", "missing"),
+    "frozen": ("torque", "frozen"),
+    "repeated": ("observation", "repeated"),
+    "out of range": ("torque", "out of range"),
+    "gap": ("time", "gap"),
+}
+"""What is named with which fault."""
 
 
-@pytest.mark.parametrize(
-    ("fault", "what", "name"),
-    [
-        ("missing", "torque", "missing"),
-        ("missing now and then", "torque", "missing"),
-        ("wild", "torque", "missing"),
-        ("frozen", "torque", "frozen"),
-        ("repeated", "observation", "repeated"),
-        ("out of range", "torque", "out of range"),
-        ("gap", "time", "gap"),
-    ],
-)
-def test_each_fault_of_the_stream(fault, what, name):
-    scan = scan_episodes(broken(fault), sensors=SENSORS, detector="mahalanobis")
-    assert [one.episode.name for one in scan.episodes if one.faults] == ["e6"]
-    (seen,) = [f for f in scan.episodes[6].faults if f.fault == name]
+@pytest.fixture(scope="module")
+def broken():
+    """A scan of 30 episodes, of which one has each fault from row 60 on."""
+    episodes = [episode(x, f"e{i}", time=0.1 * np.arange(150)) for i, x in enumerate(logs(n=30))]
+    for fault, one in zip(FAULTS, episodes[6:], strict=False):
+        rows, time = one.observations, one.time
+        if fault == "missing":
+            rows[60:70, 1] = np.nan
+        elif fault == "missing now and then":
+            rows[60:90:3, 1] = np.nan
+        elif fault == "wild":
+            rows[60:70, 1] = 1e30
+        elif fault == "frozen":
+            rows[60:90, 1] = rows[60, 1]
+        elif fault == "repeated":
+            rows[60:90] = rows[60]
+        elif fault == "out of range":
+            rows[60:70, 1] = 900.0
+        elif fault == "gap":
+            time[60:] += 7.0
+    return scan_episodes(episodes, sensors=SENSORS, detector="mahalanobis")
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_each_fault_of_the_stream(fault, broken):
+    names = [f"e{6 + i}" for i in range(len(FAULTS))]
+    assert [one.episode.name for one in broken.episodes if one.faults] == names
+    found, (what, name) = broken.episodes[6 + [*FAULTS].index(fault)], FAULTS[fault]
+    (seen,) = [f for f in found.faults if f.fault == name]
     assert seen.what == what
     assert 60 <= seen.row <= {"missing": 62, "repeated": 72}.get(name, 66)
-    assert scan.episodes[6].odd
-    assert what in scan.episodes[6].suspects
+    assert found.odd
+    assert what in found.suspects
 
 
 def test_a_gap_between_pieces_of_one_recording():
@@ -528,7 +533,7 @@ def test_pictures_are_bounded(scan):
     text = page(many)
     assert text.count("<svg") == PICTURES
     assert "7 more" in text
-    long = [episode(x, f"e{i}") for i, x in enumerate(logs(n=9, rows=30_000))]
+    long = [episode(x, f"e{i}") for i, x in enumerate(logs(n=9, rows=12_000))]
     long[2].observations[9_000:, 1] += 40
     assert len(page(scan_episodes(long, detector="mahalanobis"))) < 100_000
 

@@ -6,7 +6,6 @@ import math
 import re
 import zlib
 from importlib import resources
-from pathlib import Path
 
 import pytest
 from helpers_records import make_record
@@ -83,13 +82,6 @@ def test_without_a_number_nothing_is_decided():
     assert ABOVE.verdict(Estimate(environments=7, expected=7)) == "undecided"
 
 
-def test_a_region_is_printed_in_the_unit_of_its_metric():
-    assert ABOVE.describe("auc") == "> 0"
-    assert BETWEEN.describe("auc") == "between -2 and 2"
-    assert BETWEEN.describe("far") == "between -0.02 and 0.02"
-    assert BELOW.describe("auc") == "< 1"
-
-
 def records_of(world):
     """Records of every setting everywhere; `world` gives (auc, delay, far) of a cell."""
     made = []
@@ -144,30 +136,14 @@ def noise(setting, anomaly):
 
 
 @pytest.fixture(scope="module")
-def claimed():
-    return Estimator(records_of(as_claimed))
-
-
-@pytest.fixture(scope="module")
-def denied():
-    return Estimator(records_of(opposite))
+def worlds():
+    return [Estimator(records) for records in (records_of(as_claimed), records_of(opposite), [])]
 
 
 @pytest.mark.parametrize("claim", ABOUT_DETECTORS, ids=lambda c: c.id)
-def test_a_claim_is_confirmed_where_it_is_true(claim, claimed):
-    assert judge(claim, claim.metric, claimed).verdict == "confirmed"
-
-
-@pytest.mark.parametrize("claim", ABOUT_DETECTORS, ids=lambda c: c.id)
-def test_a_claim_is_refuted_where_the_opposite_is_true(claim, denied):
-    assert judge(claim, claim.metric, denied).verdict == "refuted"
-
-
-@pytest.mark.parametrize("claim", [*ABOUT_DETECTORS, *SETTLED], ids=lambda c: c.id)
-def test_a_claim_is_not_run_without_records(claim):
-    judged = judge(claim, claim.metric, Estimator([]))
-    assert judged.verdict == "not run"
-    assert math.isnan(judged.estimate.value)
+def test_a_claim_is_confirmed_where_it_is_true_and_refuted_where_its_opposite_is(claim, worlds):
+    verdicts = [judge(claim, claim.metric, world).verdict for world in worlds]
+    assert verdicts == ["confirmed", "refuted", "not run"]
 
 
 def test_noise_decides_nothing_but_what_its_means_say():
@@ -203,16 +179,12 @@ def test_what_is_settled_says_so_in_any_world_and_is_not_counted(world):
     assert shown[SETTLED[0]][1].startswith("by definition: ")
 
 
-def largest_by_environment(differences):
-    return max(map(abs, differences))
-
-
 def test_upper_ends_are_the_papers_own_numbers():
     digits = json.loads(resources.files("oodd_eval.data").joinpath("paper_tables.json").read_text())
     sizes = digits["table4_ensemble_auc"].values()
-    horizons = largest_by_environment(e["1"]["5"] - e["10"]["5"] for e in sizes) / 100
+    horizons = max(abs(e["1"]["5"] - e["10"]["5"]) for e in sizes) / 100
     groups = [e["delay"] for e in digits["table5_groups_delta1"].values()]
-    delays = largest_by_environment(g["dynamics"]["avg"] - g["sensor"]["avg"] for g in groups)
+    delays = max(abs(g["dynamics"]["avg"] - g["sensor"]["avg"]) for g in groups)
     worded = [c for c in CLAIMS if re.search("slightly|small|similar", c.text)]
     assert {c.id for c in worded} == {
         "horizon-similar-10", "horizon-similar-20", "horizon-dynamics-10", "horizon-dynamics-20",
@@ -223,9 +195,6 @@ def test_upper_ends_are_the_papers_own_numbers():
         assert claim.region.below == pytest.approx(end)
         assert claim.region.above in (0.0, -claim.region.below)
         assert claim.source.startswith("Table")
-        assert (
-            claim.source in claims_table(rulings(Estimator([]), None)).rows[CLAIMS.index(claim)][4]
-        )
 
 
 @pytest.mark.parametrize(
@@ -264,14 +233,6 @@ environments = ["ant"]
 """
 
 
-def test_the_claim_that_the_docs_show_can_be_added(tmp_path):
-    page = Path(__file__).parents[2] / "docs" / "reproduce.md"
-    shown = page.read_text().partition("```toml\n")[2].partition("```")[0]
-    (tmp_path / "claims.toml").write_text(shown)
-    (claim,) = read_tables(tmp_path / "claims.toml", "claim", Claim.of)
-    assert (claim.fair, claim.environments) == ("auc_matched", ("ant",))
-
-
 @pytest.mark.parametrize(
     ("old", "new", "part"),
     [
@@ -291,7 +252,7 @@ def test_a_wrong_claim_is_named_with_what_is_wrong(tmp_path, old, new, part):
         read_tables(tmp_path / "claims.toml", "claim", Claim.of)
 
 
-def test_a_claim_about_every_environment_waits_for_all_of_them():
+def test_claims_wait_for_all_environments():
     claim = BY_ID["non-trivial"]
     records = [make_record("riqn", "ant", a, values={"auc": [0.8, 0.8]}) for a in TABLE1]
     assert judge(claim, "auc", Estimator(records)).verdict == "undecided"
@@ -300,14 +261,6 @@ def test_a_claim_about_every_environment_waits_for_all_of_them():
     for given in (records, records[::-1]):
         judged = judge(claim, "auc", Estimator(given))
         assert (judged.verdict, judged.estimate.value) == ("undecided", pytest.approx(0.3))
-
-
-def test_half_a_point_of_the_return_is_negligible():
-    returns = {e: {k: [100.0 - (k != "nominal")] * 4 for k in KINDS} for e in ENVIRONMENTS}
-    assert judge(BY_ID["returns-fall"], "return", Estimator([]), returns).verdict == "negligible"
-
-
-def test_a_claim_about_a_mean_waits_for_all_environments():
     claim = BY_ID["riqn-ms-above-npn-1"]
     records = [
         make_record(d, e, a, values={"auc": [auc, auc]})
@@ -332,31 +285,31 @@ def test_a_failed_cell_decides_nothing_and_is_named():
     assert "timeout" in claims_table([ruling]).rows[0]
 
 
-def test_loss_of_return_is_paired_and_a_share_of_the_nominal():
-    # Nominal 100 and 200; sensor anomalies cost 10 % of it, dynamics anomalies 30 %.
+def returns_of(sensor, dynamics):
+    """Returns of 100 and 200, of which so many shares are left in each group of anomalies."""
     share = {"nominal": 1.0} | {
-        a.id: 0.9 if a.group == "sensor" else 0.7 for a in map(ANOMALIES.get, TABLE1)
+        a.id: sensor if a.group == "sensor" else dynamics for a in map(ANOMALIES.get, TABLE1)
     }
-    found = {e: {k: [100 * s, 200 * s] for k, s in share.items()} for e in ENVIRONMENTS}
-    made = {r.claim: r.paper for r in rulings(Estimator([]), found) if r.claim in OF_RETURNS}
-    # Proportional in every trajectory: resampling cannot change it.
+    return {e: {k: [100 * s, 200 * s] for k, s in share.items()} for e in ENVIRONMENTS}
+
+
+@pytest.mark.parametrize(
+    ("sensor", "dynamics", "verdicts"),
+    [
+        (0.9, 0.7, ("confirmed", "confirmed")),
+        (0.3, 0.1, ("refuted", "confirmed")),
+        (1.1, 1.2, ("refuted", "refuted")),
+    ],
+)
+def test_loss_of_return_is_paired_and_a_share_of_the_nominal(sensor, dynamics, verdicts):
+    made = {r.claim: r.paper for r in rulings(Estimator([]), returns_of(sensor, dynamics))}
+    assert tuple(made[c].verdict for c in OF_RETURNS) == verdicts
     for claim in OF_RETURNS:
-        e = made[claim].estimate
-        assert (e.value, e.low, e.high) == pytest.approx((0.2, 0.2, 0.2))
-        assert made[claim].verdict == "confirmed"
-
-
-def test_returns_that_collapse_or_rise_refute_the_claims_about_them():
-    def both(sensor, dynamics):
-        share = {"nominal": 1.0} | {
-            a.id: sensor if a.group == "sensor" else dynamics for a in map(ANOMALIES.get, TABLE1)
-        }
-        found = {e: {k: [100 * s, 200 * s] for k, s in share.items()} for e in ENVIRONMENTS}
-        made = {r.claim: r.paper.verdict for r in rulings(Estimator([]), found)}
-        return tuple(made[c] for c in OF_RETURNS)
-
-    assert both(0.3, 0.1) == ("refuted", "confirmed")
-    assert both(1.1, 1.2) == ("refuted", "refuted")
+        # Proportional in every trajectory: resampling cannot change it.
+        e, expected = made[claim].estimate, 1 - (sensor + dynamics) / 2
+        assert (e.value, e.low, e.high) == pytest.approx((expected,) * 3)
+    slight = judge(BY_ID["returns-fall"], "return", Estimator([]), returns_of(0.99, 0.99))
+    assert slight.verdict == "negligible"
 
 
 def test_negative_returns_lose_when_they_fall():

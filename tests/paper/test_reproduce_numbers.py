@@ -97,13 +97,10 @@ def test_an_interval_is_as_wide_as_the_trajectories_that_count_make_it():
     assert many.high - many.low > 0.9 * (few.high - few.low)
 
 
-def test_difference_is_paired_over_test_seeds():
+def test_difference_is_paired_and_uses_the_detector_seeds_that_both_sides_have():
     records = everywhere("riqn", [0.9, 0.3]) + everywhere("rf", [0.8, 0.2])
     estimate = combine(records, [side(RIQN), side(RF, -1.0)], ["ant", "hopper"])
     assert (estimate.value, estimate.low, estimate.high) == pytest.approx((0.1, 0.1, 0.1))
-
-
-def test_difference_uses_the_detector_seeds_that_both_sides_have():
     records = everywhere("riqn", [0.9, 0.9]) + everywhere("riqn", [0.1, 0.1], seed=1)
     records += everywhere("rf", [0.5, 0.5])
     assert combine(records, [side(RIQN), side(RF, -1.0)], ["ant"]).value == pytest.approx(0.4)
@@ -135,15 +132,12 @@ def test_the_mean_over_models_needs_all_of_them():
     assert (estimate.environments, estimate.expected) == (1, 2)
 
 
-def test_a_missing_cell_is_no_number():
+def test_a_missing_cell_is_no_number_and_a_failed_one_its_state():
     records = [r for r in everywhere("riqn", [0.8, 0.8]) if r.anomaly != "drift"]
     estimate = combine(records, [side(RIQN)], ["ant"])
     assert show(estimate, "auc") == "not run"
     kept = combine(records, [side(RIQN, anomalies=("iid",))], ["ant"])
     assert show(kept, "auc") == "80.0 [80.0, 80.0]"
-
-
-def test_a_failed_cell_is_its_state():
     records = everywhere("riqn", [0.8, 0.8])
     records[3] = make_record("riqn", "ant", records[3].anomaly, status="oom", reason="too large")
     assert show(combine(records, [side(RIQN)], ["ant", "hopper"]), "auc") == "oom"
@@ -157,21 +151,27 @@ def test_what_is_printed():
 
 
 def test_digits_of_the_paper_stand_where_they_belong():
-    table_5 = BY_ID["table-5"]
-    series = {s.label: s for s in table_5.series}
-    assert paper_number(table_5, series["NPN"], "walker2d", SENSOR, "auc") == 1.0
-    assert paper_number(table_5, series["RIQN"], "hopper", DYNAMICS, "delay") == 5.24
-    assert paper_number(table_5, series["AVG"], "acrobot", SENSOR, "auc") == pytest.approx(0.9479)
-    assert math.isnan(paper_number(table_5, series["RIQN"], "hopper", SENSOR, "auc_matched"))
-    table_4 = BY_ID["table-4"]
-    alone = {s.label: s for s in table_4.series}["Δ = 10: e = 1"]
-    assert paper_number(table_4, alone, "hopper", ALL, "auc") == pytest.approx(0.776)
-    table_3 = BY_ID["table-3"]
-    by_label = {s.label: s for s in table_3.series}
-    n_riqn, far = by_label["Δ = 10: N-RIQN"], by_label["Δ = 20: RIQN"]
-    assert paper_number(table_3, n_riqn, "ant", ALL, "auc") == pytest.approx(0.747)
-    assert math.isnan(paper_number(table_3, n_riqn, "hopper", ALL, "auc"))
-    assert math.isnan(paper_number(table_3, far, "ant", ALL, "auc"))
+    def digit(experiment, label, environment, anomalies, metric="auc"):
+        (series,) = [s for s in BY_ID[experiment].series if s.label == label]
+        return paper_number(BY_ID[experiment], series, environment, anomalies, metric)
+
+    assert digit("table-5", "NPN", "walker2d", SENSOR) == 1.0
+    assert digit("table-5", "RIQN", "hopper", DYNAMICS, "delay") == 5.24
+    assert digit("table-5", "AVG", "acrobot", SENSOR) == pytest.approx(0.9479)
+    assert math.isnan(digit("table-5", "RIQN", "hopper", SENSOR, "auc_matched"))
+    assert digit("table-4", "Δ = 10: e = 1", "hopper", ALL) == pytest.approx(0.776)
+    assert digit("table-3", "Δ = 10: N-RIQN", "ant", ALL) == pytest.approx(0.747)
+    assert math.isnan(digit("table-3", "Δ = 10: N-RIQN", "hopper", ALL))
+    assert math.isnan(digit("table-3", "Δ = 20: RIQN", "ant", ALL))
+    sweep = BY_ID["figure-samples"]
+    found = [paper_number(sweep, s, "ant", ALL, "auc") for s in sweep.series]
+    assert [math.isnan(x) for x in found] == [True, False, True, True]
+    # The paper's mean stands only where it has every environment.
+    numbers = compute(BY_ID["table-3"], Estimator([]))
+    assert math.isnan(numbers["mean", "Δ = 1: RIQN", "all", "auc"].paper)
+    mean = compute(BY_ID["table-4"], Estimator([]))["mean", "Δ = 1: e = 5", "all", "auc"].paper
+    seven = [89.01, 86.7, 86.0, 86.5, 87.0, 86.7, 85.1]
+    assert 100 * mean == pytest.approx(sum(seven) / 7)
 
 
 @pytest.mark.parametrize(("label", "mean"), [("RIQN", 89.4), ("RIQN+MS", 89.8), ("NPN", 87.6),
@@ -181,12 +181,6 @@ def test_the_papers_means_over_table_5(label, mean):
     series = {s.label: s for s in figure.series}[f"Δ = 1: {label}"]
     found = [paper_number(figure, series, e, ALL, "auc") for e in ENVIRONMENTS]
     assert 100 * np.mean(found) == pytest.approx(mean, abs=0.06)
-
-
-def test_sweep_of_samples_has_the_papers_digit_at_eight_only():
-    sweep = BY_ID["figure-samples"]
-    found = [paper_number(sweep, s, "ant", ALL, "auc") for s in sweep.series]
-    assert [math.isnan(x) for x in found] == [True, False, True, True]
 
 
 def test_table_has_ours_and_the_papers_below():
@@ -212,15 +206,6 @@ def test_a_mean_without_all_environments_is_in_the_table_and_not_in_the_figure()
     assert shown["Ant"] == pytest.approx(70.0)
     assert math.isnan(shown["CartPole"])
     assert math.isnan(shown["Mean"])
-
-
-def test_the_papers_mean_stands_only_where_it_has_every_environment():
-    numbers = compute(BY_ID["table-3"], Estimator([]))
-    assert math.isnan(numbers["mean", "Δ = 1: RIQN", "all", "auc"].paper)
-    numbers = compute(BY_ID["table-4"], Estimator([]))
-    seven = [89.01, 86.7, 86.0, 86.5, 87.0, 86.7, 85.1]
-    mean = numbers["mean", "Δ = 1: e = 5", "all", "auc"].paper
-    assert 100 * mean == pytest.approx(sum(seven) / 7)
 
 
 def test_every_experiment_lays_out_every_number():
@@ -304,7 +289,7 @@ def test_records_of_other_data_setups_or_seeds_are_left_out(tmp_path):
         assert (tmp_path / "b" / path.relative_to(tmp_path / "a")).read_bytes() == path.read_bytes()
 
 
-def test_caption_names_data_seeds_and_a_reduced_tier():
+def test_caption_names_data_seeds_and_a_reduced_tier(tmp_path):
     table = BY_ID["table-3"]
     records = everywhere("riqn", [0.8, 0.6]) + everywhere("riqn", [0.8, 0.6], seed=1)
     numbers = compute(table, Estimator([*records, *everywhere("riqn", [0.8, 0.6], horizon=10)]))
@@ -315,9 +300,6 @@ def test_caption_names_data_seeds_and_a_reduced_tier():
     less = dataclasses.replace(whole, tier=TIERS["reduced"], split="reduced", test=20)
     for part in (caption(less, table, numbers), returns_caption(less)):
         assert "20 of 50 test seeds of split standard" in part
-
-
-def test_returns_are_kept_and_read_back(tmp_path):
     found = {"acrobot": {k: [-80.0, -90.0] for k in KINDS}}
     (tmp_path / RETURNS).write_text(dump_returns(found, "ab" * 32))
     assert load_returns(tmp_path, "ab" * 32) == found

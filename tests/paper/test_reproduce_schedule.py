@@ -1,5 +1,6 @@
 """What is run in which order, how long it takes, and what is told of it."""
 
+import contextlib
 import dataclasses
 
 import pytest
@@ -7,7 +8,6 @@ from helpers_records import make_record
 from oodd_paper.experiments import EXPERIMENTS, TIERS
 from oodd_paper.run import (
     Progress,
-    duration,
     estimated_cost,
     lay_out,
     remaining_seconds,
@@ -38,12 +38,16 @@ def make_unit(setting=RIQN, fit="a", seed=0, key=""):
                 scores_key=key, fit_key=fit)  # fmt: skip
 
 
-def test_every_unit_is_there_once(mini):
+def test_every_unit_is_there_once_and_only_what_is_wanted(mini):
     labels = [(u.environment, u.setting.label(u.seed)) for u in mini]
     assert len(set(labels)) == len(labels) == 315
     assert len({u.scores_key for u in mini}) == 315
     assert {u.environment for u in mini} == set(ENVIRONMENTS)
     assert all(len(u.conditions) == 8 for u in mini)
+    delays = [e for e in EXPERIMENTS if e.id == "delays"]
+    units = lay_out(delays, TIERS["mini"], load_split("mini"), discover())
+    assert {str(u.setting) for u in units} == {"riqn", "riqn[h=10]", "riqn[h=20]"}
+    assert len(units) == 7 * (3 + 1 + 1)
 
 
 def test_a_device_reaches_the_detectors_that_have_one_and_changes_no_row(mini):
@@ -72,13 +76,6 @@ def test_seeds_are_three_at_delta_one_and_one_where_scoring_is_expensive():
     assert TIERS["full"].seeds(Setting("riqn", 20)) == range(3)
 
 
-def test_only_what_is_wanted_is_laid_out():
-    delays = [e for e in EXPERIMENTS if e.id == "delays"]
-    units = lay_out(delays, TIERS["mini"], load_split("mini"), discover())
-    assert {str(u.setting) for u in units} == {"riqn", "riqn[h=10]", "riqn[h=20]"}
-    assert len(units) == 7 * (3 + 1 + 1)
-
-
 def test_sampling_sizes_share_a_fit_that_the_first_of_them_makes(mini):
     ant = [u for u in mini if u.environment == "ant" and u.seed == 0]
     own = [u for u in ant if u.setting.detector == "riqn" and "members" not in u.setting.overrides]
@@ -98,6 +95,14 @@ def test_a_shared_fit_is_counted_once_and_a_kept_one_not_at_all():
     assert remaining_seconds(units, ROWS, ()) == pytest.approx(scoring + costs[0][0] + costs[2][0])
     assert remaining_seconds(units, ROWS, {"a"}) == pytest.approx(scoring + costs[2][0])
     assert remaining_seconds([], ROWS, ()) == 0
+    (fit, score), (same, more) = (estimated_cost(RIQN, "ant", n) for n in (30_000, 60_000))
+    assert fit == same > 0
+    assert more - 3 == pytest.approx(2 * (score - 3))
+    split = load_split("mini")
+    with contextlib.closing(split.environment("acrobot")) as data:
+        sets = [data.calibration, data.twins, *(data.anomalous(a) for a in data.anomalies)]
+        rows = sum(int(s.lengths.sum()) + len(s) for s in sets)
+    assert scored_rows(split)["acrobot"] == rows
 
 
 def test_a_unit_is_finished_when_all_its_anomalies_are_scored():
@@ -107,27 +112,6 @@ def test_a_unit_is_finished_when_all_its_anomalies_are_scored():
     assert unfinished([unit], [records["drift"]]) == [unit]
     assert unfinished([unit], [records["drift"], failed]) == [unit]
     assert unfinished([unit], [records["drift"], failed, records["iid"]]) == []
-
-
-def test_costs_grow_with_what_is_scored_and_not_with_the_fit():
-    (fit, score), (same, more) = (estimated_cost(RIQN, "ant", n) for n in (30_000, 60_000))
-    assert fit == same > 0
-    assert more - 3 == pytest.approx(2 * (score - 3))
-    assert estimated_cost(Setting("someone-elses"), "ant", 30_000)[0] > 0
-
-
-def test_rows_are_counted_from_the_manifest():
-    split = load_split("mini")
-    data = split.environment("acrobot")
-    sets = [data.calibration, data.twins, *(data.anomalous(a) for a in data.anomalies)]
-    assert scored_rows(split)["acrobot"] == sum(int(s.lengths.sum()) + len(s) for s in sets)
-    data.close()
-
-
-@pytest.mark.parametrize(("seconds", "text"), [(7.4, "7 s"), (600, "10 min"),
-                                               (7260, "2 h 01 min")])  # fmt: skip
-def test_durations_are_readable(seconds, text):
-    assert duration(seconds) == text
 
 
 def finish(progress, unit, resumed=False, **changes):
