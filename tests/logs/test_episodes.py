@@ -10,6 +10,7 @@ from oodd_logs.marks import IntervalList, anomalous_cells, merged
 from oodd_logs.recipe import Recipe
 from oodd_logs.recorded import Recorded
 from oodd_logs.recording import Recording, Topic
+from oodd_logs.rows import TopicRows
 
 from oodd_eval.errors import OoddError, TrajectoryError, UnknownNameError, UsageError
 
@@ -212,6 +213,12 @@ def test_steps_of_a_slow_topic_are_no_gaps():
         assert len(episode.observations) == int((fast[-1] - slow[0]) * 50 + 1e-3) + 1
     with pytest.raises(UsageError, match=r"'gps' are 1 s, expected a gap of more, not 0.5 s"):
         in_memory(fast_and_slow(fast, slow), **JOINED, gap=0.5)
+    with pytest.raises(UsageError, match="rate"):
+        in_memory(fast_and_slow(fast, slow), sensors=["imu.v", "gps.v"], time="t")
+    # A topic that ends early ends the recording.
+    fast, slow = np.arange(0, 30, 0.004), np.arange(0.0, 10)
+    _, (episode,) = in_memory(fast_and_slow(fast, slow), **JOINED, gap=3.0)
+    assert episode.time[-1] == pytest.approx(12, abs=0.02)
 
 
 @pytest.mark.parametrize("silent", ["imu", "gps"])
@@ -233,13 +240,6 @@ def test_a_gap_is_where_any_topic_is_silent(silent):
         assert behind.min() > -1e-4
         assert behind.max() < 3.0 + 1e-3
     assert any("another topic has none" in line for line in source.notes)
-
-
-def test_a_topic_that_ends_early_ends_the_recording():
-    _, (episode,) = in_memory(
-        fast_and_slow(np.arange(0, 30, 0.004), np.arange(0.0, 10)), **JOINED, gap=3.0
-    )
-    assert episode.time[-1] == pytest.approx(12, abs=0.02)
 
 
 def test_a_clock_that_was_set_back_is_cut_and_labels_and_times_follow(tmp_path):
@@ -265,12 +265,6 @@ def test_a_clock_that_was_set_back_is_cut_and_labels_and_times_follow(tmp_path):
             anomalous={"x": {"files": "odd.csv"}},
         )  # fmt: skip
         assert [e.intervals for e in parts["test/x"]] == intervals, start
-
-
-def test_topics_without_a_rate_cannot_be_joined():
-    topics = {n: Topic.of({"t": np.arange(9.0), n: np.arange(9.0)}) for n in ("p", "q")}
-    with pytest.raises(UsageError, match="rate"):
-        in_memory(topics, sensors=["p.p", "q.q"], time="t")
 
 
 @pytest.mark.parametrize(
@@ -327,25 +321,20 @@ def test_wrong_stamps_are_told_with_their_row(tmp_path, stamps, keys, words):
     assert all(word in message for word in words), message
 
 
-def test_of_rows_with_one_stamp_the_later_one_holds(tmp_path):
-    folder(tmp_path, t=[0, 1, 2, 2, 3, 4, 5, 6, 7, 8])
-    _, parts = read(tmp_path, time="t", rate=1)
-    a = table(10, 0)["a"]
-    assert np.array_equal(parts["train"][0].observations[:, 0], np.delete(a, 2))
-
-
-def test_gaps_cut_recordings(tmp_path):
+def test_gaps_cut_recordings_and_of_rows_with_one_stamp_the_later_one_holds(tmp_path):
     folder(tmp_path, t=[0, 1, 2, 3, 60, 61, 62, 63, 64, 65])
     _, parts = read(tmp_path, time="t", rate=1, gap=5)
     assert [e.name for e in parts["train"]] == ["train0#0", "train0#1", "train1#0", "train1#1"]
     assert [len(e.observations) for e in parts["train"]] == [4, 6, 4, 6]
-    assert np.array_equal(parts["train"][1].observations[:, 0], table(10, 0)["a"][4:])
-
-
-def test_a_step_as_long_as_the_gap_cuts_nothing(tmp_path):
+    a = table(10, 0)["a"]
+    assert np.array_equal(parts["train"][1].observations[:, 0], a[4:])
+    # A step as long as the gap cuts nothing.
     folder(tmp_path, t=[0, 1, 2, 3, 8, 9, 10, 11, 12, 13])
     _, parts = read(tmp_path, time="t", rate=1, gap=5)
     assert [len(e.observations) for e in parts["train"]] == [14, 14]
+    folder(tmp_path, t=[0, 1, 2, 2, 3, 4, 5, 6, 7, 8])
+    _, parts = read(tmp_path, time="t", rate=1)
+    assert np.array_equal(parts["train"][0].observations[:, 0], np.delete(a, 2))
 
 
 # Missing values
@@ -361,62 +350,43 @@ def gappy(root):
     return root
 
 
-def test_missing_values_are_refused_with_the_remedy(tmp_path):
+HELD = [[1, 2], [2, 3], [2, 4], [2, 5], [5, 6], [6, 7], [7, 8], [8, 9]]
+
+
+@pytest.mark.parametrize(
+    ("missing", "rows", "note"),
+    [
+        ("hold", HELD, ("leading", "4 in 2")),
+        ("drop", [row for i, row in enumerate(HELD) if i not in (2, 3)], ("dropped", "8 in 2")),
+    ],
+)
+def test_missing_values_are_held_or_their_rows_dropped(tmp_path, missing, rows, note):
     message = problem(gappy(tmp_path))
     for word in ("train0.csv, row 0", "'a'", "missing", "'hold'", "'drop'"):
         assert word in message
-
-
-def test_missing_values_are_held_and_leading_rows_dropped(tmp_path):
-    source, parts = read(gappy(tmp_path), missing="hold")
-    rows = parts["train"][0].observations
-    assert rows.tolist() == [[1, 2], [2, 3], [2, 4], [2, 5], [5, 6], [6, 7], [7, 8], [8, 9]]
-    assert any("leading" in line and "4 in 2" in line for line in source.notes)
-
-
-def test_rows_with_missing_values_are_dropped(tmp_path):
-    source, parts = read(gappy(tmp_path), missing="drop")
-    rows = parts["train"][0].observations
-    assert rows.tolist() == [[1, 2], [2, 3], [5, 6], [6, 7], [7, 8], [8, 9]]
-    assert any("dropped" in line and "8 in 2" in line for line in source.notes)
-
-
-@pytest.mark.parametrize("missing", ["hold", "drop"])
-def test_longer_runs_of_missing_values_are_refused(tmp_path, missing):
-    message = problem(gappy(tmp_path), missing=missing, missing_rows=1)
+    source, parts = read(tmp_path, missing=missing)
+    assert parts["train"][0].observations.tolist() == rows
+    assert any(all(word in line for word in note) for line in source.notes)
+    message = problem(tmp_path, missing=missing, missing_rows=1)
     for word in ("train0.csv, row 4", "2 rows", "missing_rows"):
         assert word in message
 
 
 def test_values_are_held_over_the_blocks_in_which_they_are_read(tmp_path, monkeypatch):
-    monkeypatch.setattr("oodd_logs.rows._CELLS", 3)
-    monkeypatch.setattr("oodd_logs.rows.TopicRows.__init__", small_steps(3))
-    _, parts = read(gappy(tmp_path), missing="hold")
-    rows = parts["train"][0].observations
-    assert rows[:, 0].tolist() == [1, 2, 2, 2, 5, 6, 7, 8]
-    assert "2 rows" in problem(tmp_path, missing="hold", missing_rows=1)
-
-
-def small_steps(rows):
-    from oodd_logs.rows import TopicRows
-
     usual = TopicRows.__init__
 
     def make(self, *arguments):
         usual(self, *arguments)
-        self._step = rows
+        self._step = 3
 
-    return make
+    monkeypatch.setattr("oodd_logs.rows._CELLS", 3)
+    monkeypatch.setattr(TopicRows, "__init__", make)
+    _, parts = read(gappy(tmp_path), missing="hold")
+    assert parts["train"][0].observations.tolist() == HELD
+    assert "2 rows" in problem(tmp_path, missing="hold", missing_rows=1)
 
 
 # Labels
-
-
-def labelled(root, values, keys=None, rows=10, **more):
-    folder(root, rows)
-    write(root / "odd.csv", table(rows, 5, label=values, **more))
-    content = {"labels": "label", "anomalous": {"leak": {"files": "odd.csv"}}}
-    return read(root, **content | (keys or {}))
 
 
 @pytest.mark.parametrize(
@@ -431,12 +401,19 @@ def labelled(root, values, keys=None, rows=10, **more):
     ],
 )
 def test_labels_may_switch_back_and_end_before_the_file(tmp_path, values, keys):
-    source, parts = labelled(tmp_path, values, keys)
+    def labelled(values):
+        folder(tmp_path)
+        write(tmp_path / "odd.csv", table(10, 5, label=values))
+        return read(tmp_path, labels="label", anomalous={"leak": {"files": "odd.csv"}}, **keys)
+
+    source, parts = labelled(values)
     (episode,) = parts["test/leak"]
     assert episode.intervals == ((2, 4), (6, 7))
     assert episode.kind == "leak"
     assert source.groups == {"leak": "dynamics"}
     assert any("2 intervals with 3 anomalous rows" in line for line in source.notes)
+    with pytest.raises(TrajectoryError, match=r"odd\.csv has no anomalous row"):
+        labelled([values[0]] * 10)
 
 
 @pytest.mark.parametrize("before", [False, True])
@@ -492,11 +469,6 @@ def test_a_nominal_file_with_anomalous_rows_is_refused_unless_windows_divide_it(
     source, parts = read(tmp_path, **keys | {"anomalous": None}, window=5)
     assert "test/leak" not in parts
     assert any("left out: 2 windows with anomalous rows" in line for line in source.notes)
-
-
-def test_an_anomalous_file_without_an_anomalous_row_is_refused(tmp_path):
-    with pytest.raises(TrajectoryError, match=r"odd\.csv has no anomalous row"):
-        labelled(tmp_path, [0] * 10)
 
 
 def test_onsets_intervals_and_fields_name_rows(tmp_path):
@@ -686,16 +658,13 @@ def test_a_northing_has_its_training_mean_subtracted(tmp_path):
     assert source.offsets == ()
 
 
-def test_a_constant_that_moves_later_has_it_too(tmp_path):
+def test_a_constant_that_moves_later_has_it_too_and_others_keep_their_value(tmp_path):
     for name in ("train0", "train1"):
         write(tmp_path / f"{name}.csv", table(10, c=np.full(10, 5.4e6)))
     write(tmp_path / "cal0.csv", table(10, c=5.4e6 + np.arange(10) / 100))
     source, parts = read(tmp_path, sensors=["a", "c"])
     assert source.offsets == (0.0, 5.4e6)
     assert parts["calibration"][0].observations[:, 1] == pytest.approx(np.arange(10) / 100)
-
-
-def test_a_constant_keeps_its_value(tmp_path):
     folder(tmp_path, firmware=[7] * 10)
     source, parts = read(tmp_path, sensors=["a", "firmware"])
     assert source.offsets == ()

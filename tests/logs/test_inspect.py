@@ -1,7 +1,6 @@
 """`data inspect` sees what a recipe has to say of logs, and nothing where there is nothing."""
 
 import csv
-import datetime as dt
 import json
 import tomllib
 import tracemalloc
@@ -102,27 +101,46 @@ def test_a_peculiar_column_is_named_and_nothing_else(clean, topic):
     assert "odd" in remarks[topic]
 
 
-def test_degrees_wrap_too_and_what_jumps_by_less_does_not(clean):
-    logs = with_columns(
-        clean,
-        heading=wrapped(360.0),
-        sawtooth=wrapped(5.0),
-        noise=lambda rows, i: np.random.default_rng(i).uniform(-3.1, 3.1, rows),
-    )
-    assert logs.columns["heading"].wraps == 360
-    assert not logs.columns["sawtooth"].wraps
-    assert not logs.columns["noise"].wraps
-
-
-def test_what_float32_keeps_is_not_remarked(clean):
+def test_what_float32_keeps_and_what_jumps_by_less_is_not_remarked(clean):
     logs = with_columns(
         clean,
         temperature=lambda rows, i: 300 + np.random.default_rng(i).normal(0, 5, rows),
         pressure=lambda rows, i: 101_325 + np.random.default_rng(i).normal(0, 0.5, rows),
+        heading=wrapped(360.0),
+        sawtooth=wrapped(5.0),
+        noise=lambda rows, i: np.random.default_rng(i).uniform(-3.1, 3.1, rows),
     )
     # Steps of float32 are 3e-5 at 300 and .008 at 101 325.
     assert not logs.columns["temperature"].coarse
     assert logs.columns["pressure"].coarse
+    wraps = {name: logs.columns[name].wraps for name in ("heading", "sawtooth", "noise")}
+    assert wraps == {"heading": 360, "sawtooth": 0, "noise": 0}
+
+
+def after_row_30(by):
+    stamps = np.arange(60) * 0.01
+    stamps[30:] += by
+    return stamps
+
+
+@pytest.mark.parametrize(
+    ("stamps", "topic", "words"),
+    [
+        (after_row_30(1.5), "gaps", ["1.51 s before row 30 of run-3.csv", "gap = 0.2"]),
+        (after_row_30(-0.1), "falls", ["1 row earlier"]),
+        (np.arange(60) * 0.02, "rates", ["run-3.csv", "0.02 s"]),
+    ],
+)
+def test_a_clock_of_one_file_is_told(clean, stamps, topic, words):
+    write(clean / "run-3.csv", {"t": stamps} | process(60))
+    logs = inspect_logs(clean)
+    remarks = topics(logs)
+    assert remarks.keys() - {"gaps"} == {"time", "nominal", topic} - {"gaps"}
+    assert all(word in remarks[topic] for word in words)
+    recipe = Recipe.parse(tomllib.loads(draft(logs)))
+    assert (recipe.time, recipe.rate) == ("t", 100)
+    if topic == "falls":
+        assert recipe.gap == 0.2
 
 
 def test_missing_cells_are_counted_at_the_start_and_in_runs(tmp_path):
@@ -155,34 +173,6 @@ def test_blocks_count_as_the_whole_does():
     for facts in (whole, parts, pair):
         assert facts.numbers.mean == pytest.approx(np.nanmean(values), abs=1e-9)
         assert facts.numbers.spread == pytest.approx(np.nanstd(values), rel=1e-9)
-
-
-def test_gaps_are_counted_and_the_longest_is_named(clean):
-    stamps = np.arange(60) * 0.01
-    stamps[30:] += 1.5
-    write(clean / "run-3.csv", {"t": stamps} | process(60))
-    remarks = topics(inspect_logs(clean))
-    assert remarks.keys() == {"time", "nominal", "gaps"}
-    assert "1.51 s before row 30 of run-3.csv" in remarks["gaps"]
-    assert "gap = 0.2" in remarks["gaps"]
-
-
-def test_a_clock_that_was_set_back_is_cut_there(clean):
-    stamps = np.arange(60) * 0.01
-    stamps[30:] -= 0.1
-    write(clean / "run-3.csv", {"t": stamps} | process(60))
-    logs = inspect_logs(clean)
-    assert "1 row earlier" in topics(logs)["falls"]
-    recipe = Recipe.parse(tomllib.loads(draft(logs)))
-    assert (recipe.time, recipe.rate, recipe.gap) == ("t", 100, 0.2)
-
-
-def test_one_file_at_another_rate(clean):
-    write(clean / "run-7.csv", times(60, 0.02) | process(60))
-    remarks = topics(inspect_logs(clean))
-    assert remarks.keys() == {"time", "nominal", "rates"}
-    assert "run-7.csv" in remarks["rates"]
-    assert "0.02 s" in remarks["rates"]
 
 
 @pytest.mark.parametrize(
@@ -298,33 +288,22 @@ def test_a_transposed_matrix_is_noticed_by_its_neighbours_and_read_as_it_is_mean
 
 
 def test_a_first_row_that_counts_gives_a_transposed_matrix_away(tmp_path):
-    rows = np.vstack([np.arange(300), np.random.default_rng(0).normal(size=(3, 300))])
-    np.savetxt(tmp_path / "a.dat", rows)
-    assert inspect_logs(tmp_path).transposed == ["a.dat"]
-    np.savetxt(tmp_path / "a.dat", rows.T)
-    assert not inspect_logs(tmp_path).transposed
+    rng = np.random.default_rng(0)
+    rows = np.vstack([np.arange(300), rng.normal(size=(3, 300))])
+    for matrix, transposed in ((rows, ["a.dat"]), (rows.T, []), (rng.normal(size=(15, 20)), [])):
+        np.savetxt(tmp_path / "a.dat", matrix)
+        assert inspect_logs(tmp_path).transposed == transposed
 
 
-def test_short_matrices_are_not_taken_for_transposed_ones(tmp_path):
-    np.savetxt(tmp_path / "a.dat", np.random.default_rng(0).normal(size=(15, 20)))
-    assert not inspect_logs(tmp_path).transposed
-
-
-def test_equal_files_are_named_whatever_their_bytes(tmp_path):
+def test_equal_files_are_named_and_those_without_a_column_in_common_left_out(tmp_path):
     for name, seed in (("a", 0), ("b", 1), ("c", 0)):
         write(tmp_path / f"{name}.csv", process(50, seed), ";" if name == "c" else ",")
-    assert inspect_logs(tmp_path).equal == [["a.csv", "c.csv"]]
-    assert draft_recipe(tmp_path).nominal.files == ("a.csv", "b.csv")
-
-
-def test_files_with_no_column_in_common_are_not_drafted_together(tmp_path):
-    for i in range(3):
-        write(tmp_path / f"arm-{i}.csv", process(50, i))
     write(tmp_path / "room.csv", {"temperature": np.random.default_rng(0).normal(20, 1, 50)})
     logs = inspect_logs(tmp_path)
+    assert logs.equal == [["a.csv", "c.csv"]]
     assert "temperature" in topics(logs)["headers"]
     recipe = draft_recipe(tmp_path)
-    assert recipe.nominal.files == ("arm*.csv",)
+    assert recipe.nominal.files == ("a.csv", "b.csv")
     assert recipe.sensors == ("q[rad]", "tau[N m]")
 
 
@@ -369,16 +348,12 @@ def test_a_recording_that_ends_as_another_begins_is_named(tmp_path):
     # It has a label, and times of its own.
     write(tmp_path / "odd.csv", times(360) | rest | {"fault": np.arange(360) > 300})
     write(tmp_path / "other.csv", times(300) | process(300, 2))
+    for i in range(2):  # which stand still at either end
+        rows = {name: np.pad(x, 40) for name, x in process(200, i).items()}
+        write(tmp_path / f"{i}.csv", times(280) | rows)
     logs = inspect_logs(tmp_path)
     assert logs.continued == [("free.csv", "odd.csv", 60)]
     assert "60 rows of free.csv" in topics(logs)["continued"]
-
-
-def test_recordings_that_stand_still_at_either_end_are_not_taken_for_one(tmp_path):
-    for i in range(2):
-        rows = {name: np.pad(x, 40) for name, x in process(200, i).items()}
-        write(tmp_path / f"{i}.csv", times(280) | rows)
-    assert not inspect_logs(tmp_path).continued
 
 
 def test_a_file_of_intervals_is_no_recording(clean):
@@ -389,15 +364,17 @@ def test_a_file_of_intervals_is_no_recording(clean):
     assert draft_recipe(clean).intervals == "labels.csv"
 
 
-def test_other_formats_are_told(clean):
-    (clean / "notes.pdf").write_bytes(b"%PDF")
-    assert ".pdf" in topics(inspect_logs(clean))["others"]
-
-
 def test_a_file_that_cannot_be_read_is_reported_beside_the_others(clean):
+    (clean / "notes.pdf").write_bytes(b"%PDF")
     (clean / "run-2.csv").write_text("t,q\n1,2\n1,2,3,4\n")
-    remarks = topics(inspect_logs(clean))
+    logs = inspect_logs(clean)
+    remarks = topics(logs)
+    assert ".pdf" in remarks["others"]
     assert "run-2.csv" in remarks["unreadable"]
+    assert "left out, as they cannot be read: run-2.csv" in draft(logs)
+    patterns = draft_recipe(clean).nominal.files
+    matched = {path.name for pattern in patterns for path in clean.glob(pattern)}
+    assert matched == {f"run-{i}.csv" for i in range(40) if i != 2}
     for path in clean.glob("run-*.csv"):
         path.write_text("t,q\n1,2\n1,2,3,4\n")
     with pytest.raises(TrajectoryError, match=r"run-0\.csv"):
@@ -482,30 +459,6 @@ def test_the_command_advises_only_scans_that_work(tmp_path, capsys, rows, text, 
     command = out.split("Which of them are odd: oodd-eval ")[1].split(" A first")[0]
     assert command.endswith(advised)
     assert main(command.split()) in {0, 1}
-
-
-def test_a_first_recipe_leaves_out_a_file_that_cannot_be_read(clean):
-    (clean / "run-7.csv").write_text("")
-    assert "left out, as they cannot be read: run-7.csv" in draft(inspect_logs(clean))
-    patterns = draft_recipe(clean).nominal.files
-    matched = {path.name for pattern in patterns for path in clean.glob(pattern)}
-    assert matched == {f"run-{i}.csv" for i in range(40) if i != 7}
-
-
-def test_a_recipe_elsewhere_names_the_root(clean, tmp_path_factory, capsys):
-    elsewhere = tmp_path_factory.mktemp("recipes") / "arm.toml"
-    assert main(["data", "inspect", str(clean), "--recipe", str(elsewhere)]) == 0
-    assert f"--root {clean}" in capsys.readouterr().out
-    assert Recipe.load(elsewhere).nominal.files == ("*.csv",)
-
-
-def test_dates_are_times(tmp_path):
-    start = dt.datetime(2024, 5, 1, tzinfo=dt.UTC).replace(tzinfo=None)
-    stamps = [(start + dt.timedelta(seconds=k)).isoformat() for k in range(30)]
-    write(tmp_path / "a.csv", {"when": stamps} | process(30))
-    logs = inspect_logs(tmp_path)
-    assert logs.times == {"when": "date"}
-    assert draft_recipe(tmp_path).rate == 1
 
 
 def test_an_outcome_and_a_task_of_each_episode_are_named(tmp_path):

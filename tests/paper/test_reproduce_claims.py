@@ -304,9 +304,10 @@ def returns_of(sensor, dynamics):
 def test_loss_of_return_is_paired_and_a_share_of_the_nominal(sensor, dynamics, verdicts):
     made = {r.claim: r.paper for r in rulings(Estimator([]), returns_of(sensor, dynamics))}
     assert tuple(made[c].verdict for c in OF_RETURNS) == verdicts
-    for claim in OF_RETURNS:
+    lost = (1 - (sensor + dynamics) / 2, sensor - dynamics)
+    for claim, expected in zip(OF_RETURNS, lost, strict=True):
         # Proportional in every trajectory: resampling cannot change it.
-        e, expected = made[claim].estimate, 1 - (sensor + dynamics) / 2
+        e = made[claim].estimate
         assert (e.value, e.low, e.high) == pytest.approx((expected,) * 3)
     slight = judge(BY_ID["returns-fall"], "return", Estimator([]), returns_of(0.99, 0.99))
     assert slight.verdict == "negligible"
