@@ -146,44 +146,32 @@ def test_all_detector_seeds_count():
 
 
 def test_the_next_weaker_rung_stands_in_where_a_ladder_has_none(monkeypatch):
+    def at(records, name):
+        found = Strengths.of(records).at(records, name)
+        return {(r.environment, r.anomaly): r.strength for r in found}
+
+    ends = {("ant", "iid"): "kept50", ("hopper", "iid"): "kept50", ("ant", "gravity"): "kept90"}
+    assert at(RECORDS, "kept50") == ends
+    # A rung that was not run is missing.
+    fewer = [r for r in RECORDS if (r.environment, r.strength) != ("hopper", "kept50")]
+    assert {environment for environment, _ in at(fewer, "kept50")} == {"ant"}
+    fewer = [r for r in RECORDS if r.anomaly == "gravity" and r.strength != "kept90"]
+    assert not at(fewer, "kept50")
+    # Strengths that no ladder has are left out.
+    cells = ("drift", "kept99"), ("iid", "harsh"), ("iid", "")
+    other = [make_record("rf", "ant", kind, strength=name) for kind, name in cells]
+    assert Strengths.of(other).rungs == {}
+    assert not strengths.strength_tables(Board(other))
+    assert Strengths.of(RECORDS + other).rungs.keys() == UNITS.keys()
     usual = of_records.rungs_of
 
     def without(*place):
         return {n: r for n, r in usual(*place).items() if place[0] != "ant" or n != "kept90"}
 
     monkeypatch.setattr(of_records, "rungs_of", without)
-    found = {
-        (r.environment, r.anomaly): r.strength for r in Strengths.of(RECORDS).at(RECORDS, "kept90")
-    }
+    found = at(RECORDS, "kept90")
     assert found["ant", "iid"] == found["ant", "gravity"] == "kept99"
     assert found["hopper", "iid"] == "kept90"
-
-
-def test_only_a_ladder_that_ends_below_a_rung_stands_in_for_it():
-    at_end = Strengths.of(RECORDS).at(RECORDS, "kept50")
-    assert {(r.environment, r.anomaly, r.strength) for r in at_end} == {
-        ("ant", "iid", "kept50"), ("hopper", "iid", "kept50"), ("ant", "gravity", "kept90"),
-    }  # fmt: skip
-    # A rung that was not run is missing.
-    fewer = [r for r in RECORDS if (r.environment, r.strength) != ("hopper", "kept50")]
-    assert {r.environment for r in Strengths.of(fewer).at(fewer, "kept50")} == {"ant"}
-    fewer = [r for r in RECORDS if r.anomaly == "gravity" and r.strength != "kept90"]
-    assert not Strengths.of(fewer).at(fewer, "kept50")
-
-
-def test_strengths_that_no_ladder_has_are_left_out():
-    cells = ("drift", "kept99"), ("iid", "harsh"), ("iid", "")
-    other = [make_record("rf", "ant", kind, strength=name) for kind, name in cells]
-    assert Strengths.of(other).rungs == {}
-    assert not strengths.strength_tables(Board(other))
-    assert Strengths.of(RECORDS + other).rungs.keys() == UNITS.keys()
-
-
-def test_without_alarms_at_5_percent_there_is_matched_auc_alone():
-    bare = [make_record("rf", "ant", "iid", strength=name) for name in TIMES]
-    assert [t.title for t in strengths.strength_tables(Board(bare), places=True)] == [
-        "Matched AUC (%) by strength"
-    ]
 
 
 def test_reports_and_the_terminal_have_the_tables_where_there_are_strengths():
@@ -196,6 +184,9 @@ def test_reports_and_the_terminal_have_the_tables_where_there_are_strengths():
         assert f"### {title}" in text
         assert title in shown.getvalue()
     assert "### rf: detection thresholds" in text
+    bare = [make_record("rf", "ant", "iid", strength=name) for name in TIMES]
+    tables = strengths.strength_tables(Board(bare), places=True)
+    assert [t.title for t in tables] == ["Matched AUC (%) by strength"]  # no alarms at 5 %
 
 
 # Results

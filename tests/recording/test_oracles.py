@@ -1,5 +1,6 @@
 """The oracle of the worlds: its equations, its filter, and what a detector owes the harness."""
 
+import functools
 import importlib.util
 import math
 from pathlib import Path
@@ -54,9 +55,14 @@ def registered_worlds():
     forget_own()
 
 
+@functools.cache
+def recorded(world, seed):
+    """A nominal episode; tests must not change it."""
+    return Setup(world, load_policy(world)).record(seed)
+
+
 def episodes(world, count, first=SEED):
-    setup = Setup(world, load_policy(world))
-    return [setup.record(first + i) for i in range(count)]
+    return [recorded(world, first + i) for i in range(count)]
 
 
 @pytest.fixture(scope="module")
