@@ -1,4 +1,4 @@
-"""Twenty logs of an arm, through the commands of docs/how-to/own-data.md as somebody follows them."""
+"""Twenty logs of an arm, through the commands of docs/how-to/own-data.md."""
 
 import json
 import re

@@ -898,7 +898,7 @@ def test_a_library_that_is_missing_is_named_with_its_extra(monkeypatch):
 
 
 READER = """
-from oodd_eval import Reader, Recording, Topic
+from oodd_logs import Reader, Recording, Topic
 
 def open_log(path, options):
     yield Recording(path.stem, str(path), {"": Topic.of({"x": [1.0, 2.0]})})
