@@ -3,6 +3,7 @@
 Nominal sensors follow ``o_t = 0.9 o_{t-1} + 0.1 e_t``; in anomalous rows the last one has 3 more.
 """
 
+import csv
 from dataclasses import dataclass
 
 import numpy as np
@@ -110,3 +111,12 @@ def log_parts(*, train=6, calibration=40, nominal=8, anomalies=None, rows=60):
 def make_log_split(directory, facts=UNPAIRED, *, name="arm", environment="arm", **sizes):
     """Write a small split of logs, sized as `log_parts` takes it; return the directory."""
     return write_log_split(directory, log_parts(**sizes), facts, name=name, environment=environment)
+
+
+def write_table(path, columns, separator=","):
+    """Write columns by name as a CSV file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="") as file:
+        rows = csv.writer(file, delimiter=separator)
+        rows.writerow(columns)
+        rows.writerows(zip(*columns.values(), strict=True))

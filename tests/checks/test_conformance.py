@@ -1,7 +1,6 @@
 """Every detector that an installed plug-in offers honours the contract."""
 
 import pytest
-import torch
 from helpers_detectors import SMALL
 from oodd_checks.testing import run_checks
 
@@ -29,14 +28,6 @@ EXPECTED_FAILURES = {
 
 # The oracle refuses any plant but its three, which the checks lack; test_oracles has its own.
 LEARNING = [name for name, offer in PLUGINS.offers.items() if offer.spec.training != "oracle"]
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.mark.parametrize(

@@ -37,14 +37,6 @@ FACTORIES = {"riqn": riqn, "riqn-ms": riqn_ms, "riqn-r": riqn_r, "n-riqn": n_riq
 SMALL = {"members": 2, "updates": 15, "batch": 8}
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
 def waves(count=6, length=60, sensors=3, seed=0, noise=0.05):
     rng = np.random.default_rng(seed)
     phases = rng.uniform(0, 2 * np.pi, (count, 1, sensors))
@@ -105,7 +97,6 @@ def test_slope_is_the_derivative_of_the_loss():
 
 @pytest.fixture(scope="module")
 def learned():
-    torch.set_num_threads(1)
     episodes = heteroscedastic(120, 100, seed=1)
     made = Ensemble(
         Architecture(features=1), [torch.Generator().manual_seed(0)], *linear_forecast(episodes, 1)
@@ -204,7 +195,6 @@ def test_the_loop_of_the_benchmark_computes_the_same(horizon):
 
 @pytest.fixture(scope="module", params=FACTORIES)
 def fitted(request):
-    torch.set_num_threads(1)
     return FACTORIES[request.param](seed=3, horizon=1, **SMALL).fit(waves())
 
 

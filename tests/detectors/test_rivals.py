@@ -43,14 +43,6 @@ NOMINAL = [episode(seed) for seed in range(8)]
 ODD = bare(episode(99).observations + np.float32(6) * (np.arange(60) >= 30)[:, None])
 
 
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
 def unfitted(name, seed=0, **values):
     return SPECS[name].factory(seed=seed, horizon=1, **{**SMALL.get(name, {}), **values})
 

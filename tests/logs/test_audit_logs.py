@@ -1,6 +1,5 @@
 """Logs as people have them become splits: each of these was refused, or came out wrong, before."""
 
-import csv
 import os
 import resource
 import tracemalloc
@@ -8,6 +7,7 @@ import types
 
 import numpy as np
 import pytest
+from helpers_logs import write_table as write
 from oodd_logs import import_frames
 from oodd_logs.importing import import_data, import_recipe
 from oodd_logs.recipe import Recipe
@@ -16,14 +16,6 @@ from oodd_eval import evaluate, load_split
 from oodd_eval.cli.main import main
 from oodd_eval.data.facts import LogFacts
 from oodd_eval.errors import OoddError, OutputError, TrajectoryError, UsageError
-
-
-def write(path, columns):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="") as file:
-        rows = csv.writer(file)
-        rows.writerow(columns)
-        rows.writerows(zip(*columns.values(), strict=True))
 
 
 def walk(rows, seed, shift=0.0, start=0, stop=0):

@@ -1,10 +1,10 @@
 """A recipe makes episodes of recordings: columns, stamps, missing values, labels, parts."""
 
-import csv
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers_logs import write_table as write
 from oodd_logs.episodes import make_episodes, read_episodes
 from oodd_logs.marks import IntervalList, anomalous_cells, merged
 from oodd_logs.recipe import Recipe
@@ -13,14 +13,6 @@ from oodd_logs.recording import Recording, Topic
 from oodd_logs.rows import TopicRows
 
 from oodd_eval.errors import OoddError, TrajectoryError, UnknownNameError, UsageError
-
-
-def write(path, columns, separator=","):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="") as file:
-        rows = csv.writer(file, delimiter=separator)
-        rows.writerow(columns)
-        rows.writerows(zip(*columns.values(), strict=True))
 
 
 def table(rows, seed=0, **more):

@@ -7,12 +7,12 @@ import tracemalloc
 
 import numpy as np
 import pytest
+from helpers_logs import write_table as write
 from oodd_logs.inspection.columns import ClockFacts, ColumnFacts, time_unit
 from oodd_logs.inspection.draft import draft, draft_recipe
 from oodd_logs.inspection.logs import inspect_logs
-from oodd_logs.inspection.report import advise, describe_logs, looks_like
+from oodd_logs.inspection.report import advise, looks_like
 from oodd_logs.recipe import Recipe
-from oodd_logs.scanning.logs import read_logs
 
 from oodd_eval.cli.main import main
 from oodd_eval.errors import TrajectoryError, UnknownNameError, UsageError
@@ -25,14 +25,6 @@ def process(rows, seed=0):
         "q[rad]": np.sin(np.arange(rows) / 20) + rng.normal(0, 0.01, rows),
         "tau[N m]": rng.normal(0, 1, rows),
     }
-
-
-def write(path, columns, separator=","):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="") as file:
-        out = csv.writer(file, delimiter=separator)
-        out.writerow(columns)
-        out.writerows(zip(*columns.values(), strict=True))
 
 
 def times(rows, step=0.01):
@@ -255,17 +247,6 @@ def test_a_first_recipe_cuts_faulty_files_only_where_labels_say_since_when(tmp_p
     assert ("once labels" in topics(logs)["few"]) == (not labelled)
 
 
-def test_a_scan_cuts_few_recordings_whatever_is_known_of_them(tmp_path):
-    for i in range(3):
-        for folder in ("good", "bad"):
-            write(
-                tmp_path / folder / f"run-{i}.csv",
-                times(1000) | process(1000, i + 9 * (folder == "bad")),
-            )
-    assert draft_recipe(tmp_path).window == 0
-    assert len(read_logs(tmp_path).episodes) == 6 * 1000 // 50
-
-
 def test_names_of_files_sort_them(tmp_path):
     for i, name in enumerate(["1_no_failure", "2_engine_failure", "3_no_failure"]):
         write(tmp_path / f"flight_{name}.csv", times(50) | process(50, i))
@@ -414,16 +395,6 @@ def test_a_long_recording_takes_few_windows_and_bounded_memory(tmp_path):
     assert logs.columns["x"].numbers.spread == pytest.approx(1, abs=0.01)
     assert "of 3000000 rows" in topics(logs)["sample"]
     assert draft_recipe(path).window == rows // 100
-
-
-@pytest.mark.parametrize("width", [80, 120])
-def test_text_fits_the_terminal(clean, width):
-    logs = with_columns(clean, **PECULIAR)
-    text = describe_logs(logs, width)
-    assert max(map(len, text.splitlines())) <= width
-    assert not any(line.endswith(" ") for line in text.splitlines())
-    assert "rad" in text
-    assert all(name in text for name in PECULIAR)
 
 
 def test_the_command_prints_and_writes_a_recipe_that_is_read(clean, capsys, monkeypatch):

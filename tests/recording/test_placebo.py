@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import torch
 from helpers_detectors import SMALL
 from helpers_split import make_group, make_split
 
@@ -14,14 +13,6 @@ from oodd_eval.plugins.discovery import discover
 
 ENVIRONMENT = "hopper"
 PLUGINS = discover()
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")

@@ -12,15 +12,6 @@ pytest.importorskip("gymnasium")
 iqn = pytest.importorskip("oodd_recording.train.iqn")
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Several threads would wait for one another while other tests run."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
 def test_quantile_huber_by_hand():
     # errors of prediction 0: 0.5 and -2; of prediction 1: -0.5 and -3
     # Huber: 0.125, 1.5; 0.125, 2.5; weights at 0.25: 0.25, 0.75; at 0.5: 0.5, 0.5

@@ -16,15 +16,6 @@ pytest.importorskip("gymnasium")
 td3 = pytest.importorskip("oodd_recording.train.td3")
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Several threads would wait for one another while other tests run."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
 OBSERVATIONS, ACTIONS, BATCH = 4, 2, 6
 
 

@@ -15,11 +15,6 @@ def block(language):
     return re.search(rf"^```{language}\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)[1]
 
 
-def test_what_a_newcomer_writes_is_under_60_lines():
-    typed = [block("python"), block("toml"), block("sh")]
-    assert sum(len(text.splitlines()) for text in typed) < 60
-
-
 @pytest.fixture
 def session(tmp_path, monkeypatch):
     (tmp_path / "oodd_pendulum.py").write_text(block("python"))

@@ -39,20 +39,6 @@ def script(monkeypatch):
     forget_own()
 
 
-def parameters(world):
-    """Return what an episode of a world has drawn but the task, and its nominal values."""
-    env, value = world.env, read_world(world.environment).value
-    if world.environment == "arm":
-        pairs = [(env.payload, 1.0)]
-        pairs += [(env.viscous, value("viscous friction")), (env.dry, value("dry friction"))]
-    elif world.environment == "drone":
-        pairs = [(env.thrust, value("thrust")), (env.wind, [0.0, 0.0])]
-        pairs += [(env.model.body_mass[1], value("mass"))]
-    else:
-        pairs = [(env.pump_gain, value("pump gain")), (env.orifice, value("orifice"))]
-    return [(np.copy(drawn), nominal) for drawn, nominal in pairs]
-
-
 @pytest.mark.parametrize("world", WORLDS)
 def test_a_world_as_it_is_has_the_bits_of_the_world(script, world):
     assert script.changed(read_world(world), variation=True, noise=True) == read_world(world)
@@ -69,28 +55,6 @@ def test_a_world_as_it_is_has_the_bits_of_the_world(script, world):
     assert recorded() == expected
     register([script.spec_of(world, False, True)])
     assert recorded() != expected
-
-
-@pytest.mark.parametrize("world", WORLDS)
-def test_without_variation_episodes_differ_in_their_task_alone(script, world):
-    simulators = []
-    for variation in (True, False):
-        for seed in (SEED, SEED + 1):
-            register([script.spec_of(world, variation, True)])
-            simulators.append((make(world), seed))
-            row = simulators[-1][0].reset(seed)
-            simulators[-1] += (row,)
-    (varied, *_), (other, *_), (plain, *_), (again, *_) = simulators
-    for drawn, nominal in parameters(plain) + parameters(again):
-        np.testing.assert_array_equal(drawn, nominal)
-    pairs = zip(parameters(varied), parameters(other), strict=True)
-    assert not any(np.array_equal(one, two) for (one, _), (two, _) in pairs)
-    # What the task has drawn: the start where it is drawn itself, and set points.
-    task = slice(0, 3) if world == "drone" else slice(MEASURED[world], None)
-    rows = [row[task] for *_, row in simulators]
-    np.testing.assert_array_equal(rows[0], rows[2])
-    np.testing.assert_array_equal(rows[1], rows[3])
-    assert not np.array_equal(rows[0], rows[1])
 
 
 @pytest.mark.parametrize("world", WORLDS)
