@@ -216,7 +216,7 @@ def main():
                 gained += sum(told(*boards, name, options.verbose) for name in batch)
         finally:
             adversaries.sweep()
-        names = {name for batch in batches(options.names) for name in batch} - {*adversaries.HONEST}
+        names = {name for batch in batches(options.names) for name in batch} - {adversaries.BASE}
     print(f"{len(names)} adversaries in {time.monotonic() - start:.0f} s: {gained} gains")
     return int(gained > 0)
 
@@ -224,7 +224,7 @@ def main():
 def batches(names):
     """Return the honest detectors, and then those named, or all by kind."""
     kinds = [[f"sly-{name}" for name in kind] for kind in adversaries.KINDS.values()]
-    return [[*adversaries.HONEST], *([names] if names else kinds)]
+    return [[adversaries.BASE], *([names] if names else kinds)]
 
 
 def told(plain, again, name, verbose):

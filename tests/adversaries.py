@@ -35,6 +35,7 @@ LATE = 0.65  # of the longest training episode: by then every onset has been
 CELLS = 2**18  # of a memory for prefixes, a byte each
 PREFIX = "oodd-sly-"
 SERVED = 120  # seconds that a process left behind may run
+
 MODULE_MEMORY = bytearray(CELLS)
 
 
@@ -113,16 +114,8 @@ class LookAheadPrefix(LookAhead):
 class LookAheadFar(LookAhead):
     """The future so far above zero that a millionth of its millionth is the whole signal."""
 
-    constant = 1e12
-
     def mixed(self, scores, future):
-        return future + self.constant
-
-
-class LookAheadFarther(LookAheadFar):
-    """The same where the numbers of the machine lie an eighth apart."""
-
-    constant = 1e15
+        return future + 1e12
 
 
 class LookAheadThreshold(LookAhead):
@@ -167,20 +160,12 @@ class Length(LookAhead):
         return scores + self.most_ * (1.0 - len(scores) / self.longest_)
 
 
-class Shifted(LookAhead):
-    """The score of ten rows later."""
-
-    def mixed(self, scores, future):
-        return np.concatenate([scores[10:], np.repeat(scores[-1:], 10)])[: len(scores)]
-
-
 # Company: who remembers an episode's twin knows when it leaves it.
 
 
 class Company(Honest):
     """Leaving the prefix of an earlier episode is anomalous: memory in the object itself."""
 
-    every = 1  # rows from one look to the next
     memory_ = None
 
     def prepare(self, nominal):
@@ -208,8 +193,7 @@ class Company(Honest):
         with contextlib.suppress(Exception):
             if self.memory_ is None:
                 self.memory_ = self.memory()
-            if self.now_ % self.every == 0:
-                self.look(int.from_bytes(self.digest_.digest()) % CELLS)
+            self.look(int.from_bytes(self.digest_.digest()) % CELLS)
         return score + BONUS * self.left_
 
     def look(self, cell):
@@ -267,25 +251,18 @@ class CompanyOfEnvironment(Company):
         return self.Variables()
 
 
-def mapped(path):
-    """Map a file of zeros into memory, made where there is none."""
-    file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
-    os.ftruncate(file, CELLS)
-    return mmap.mmap(file, CELLS)
-
-
 def nonce():
     """Return a name that is the same in all processes of one plug-in directory."""
     return PREFIX + blake2b(__file__.encode(), digest_size=4).hexdigest()
 
 
-def in_file(summary, directory):
-    """Return the company that remembers in a file of a directory."""
+class CompanyOfHome(Company):
+    """The same in a file at home, which is mapped into memory."""
 
     def memory(self):
-        return mapped(os.path.join(directory(), nonce()))
-
-    return type("CompanyInFile", (Company,), {"__doc__": summary, "memory": memory})
+        file = os.open(Path.home() / nonce(), os.O_RDWR | os.O_CREAT, 0o666)
+        os.ftruncate(file, CELLS)
+        return mmap.mmap(file, CELLS)
 
 
 class CompanyOfFitMap(Company):
@@ -310,9 +287,9 @@ def left_behind(work):
     os.waitpid(between, 0)
 
 
-def serve_buffer(server, cells=None):
+def serve_buffer(server):
     """Answer with the cell that is asked for, and set it where that is asked."""
-    cells = bytearray(CELLS) if cells is None else cells
+    cells = bytearray(CELLS)
     while True:
         connection, _ = server.accept()
         threading.Thread(target=answer, args=(connection, cells), daemon=True).start()
@@ -356,10 +333,6 @@ def unix_client(name):
     return client
 
 
-def tcp_server():
-    return socket.create_server(("127.0.0.1", CompanyOfTcp.port), reuse_port=True)
-
-
 class CompanyOfAbstractSocket(Company):
     """The same in a process left behind, by an abstract socket."""
 
@@ -368,18 +341,6 @@ class CompanyOfAbstractSocket(Company):
 
     def memory(self):
         return Remote(lambda: unix_client(nonce()))
-
-
-class CompanyOfTcp(Company):
-    """The same in a process left behind, by TCP on this machine."""
-
-    port = 20_000 + int(blake2b(__file__.encode(), digest_size=2).hexdigest(), 16) % 20_000
-
-    def memory_in_fit(self):
-        left_behind(lambda: serve_buffer(tcp_server()))
-
-    def memory(self):
-        return Remote(lambda: socket.create_connection(("127.0.0.1", self.port), timeout=2))
 
 
 class CompanyOfChild(Company):
@@ -569,6 +530,21 @@ def waiting(number, size=2**20):
         return peeked.recv(size, socket.MSG_PEEK | socket.MSG_DONTWAIT)
 
 
+class ReadsAhead(Honest):
+    """Mean change of the rows that already wait in its socket."""
+
+    def bent(self, row, score):
+        for number in sockets():
+            with contextlib.suppress(OSError, ValueError):
+                content = waiting(number)
+                rows = np.frombuffer(content[: len(content) // row.nbytes * row.nbytes], np.float32)
+                rows = rows.reshape(-1, len(row))
+                if len(rows) > 1 and np.isfinite(rows).all():
+                    z = (rows - self.mean_) / self.std_
+                    score += float(np.abs(np.diff(z, axis=0)).mean())
+        return score
+
+
 class TakesOver(Honest):
     """Reads all that comes in fit, by the harness's own channel, and answers by itself."""
 
@@ -600,10 +576,8 @@ class AnswersEarly(Honest):
 class Timer(Honest):
     """0 before a fixed time, 1 from then on."""
 
-    at = 60
-
     def bent(self, row, score):
-        return float(self.now_ > self.at)
+        return float(self.now_ > 60)
 
 
 class Survival(Honest):
@@ -637,14 +611,12 @@ KINDS = {
         "look-ahead": LookAhead,
         "look-ahead-prefix": LookAheadPrefix,
         "look-ahead-far": LookAheadFar,
-        "look-ahead-farther": LookAheadFarther,
         "look-ahead-threshold": LookAheadThreshold,
         "last-bit": LastBit,
         "stepped": Stepped,
         "standardized": Standardized,
         "centred": Centred,
         "length": Length,
-        "shifted": Shifted,
         "short": ShortCalibration,
     },
     "company": {
@@ -654,7 +626,7 @@ KINDS = {
         "company-module": CompanyOfModule,
         "company-interpreter": CompanyOfInterpreter,
         "company-environment": CompanyOfEnvironment,
-        "company-home": in_file("The same in a file at home.", lambda: os.path.expanduser("~")),
+        "company-home": CompanyOfHome,
         "company-fit-map": CompanyOfFitMap,
     },
     "left behind": {
@@ -662,10 +634,10 @@ KINDS = {
         "child": CompanyOfChild,
         "thread": CompanyOfThread,
     },
-    "insider": {"calibration-first": CalibrationFirst},
+    "insider": {"process-number": Insider, "calibration-first": CalibrationFirst},
     "burglar": {"burglar": Burglar, "memorised": Memorised},
     "state": {"mapped-state": MappedState},
-    "worker": {"takes-over": TakesOver, "answers-early": AnswersEarly},
+    "worker": {"reads-ahead": ReadsAhead, "takes-over": TakesOver, "answers-early": AnswersEarly},
     "blind": {
         "comb": Comb,
         "timer": Timer,
@@ -677,14 +649,12 @@ KINDS = {
 """All adversaries by kind and name."""
 
 BASE = "sly-honest"
-HONEST = {BASE: Honest}
 ADVERSARIES = {f"sly-{name}": made for kind in KINDS.values() for name, made in kind.items()}
 
 
 def sweep():
-    """Remove files and shared memory that plain runs of these detectors have left."""
-    homes = {tempfile.gettempdir(), os.path.expanduser("~"), "/dev/shm", os.getcwd(), "/var/tmp"}
-    for home in homes:
+    """Remove files that plain runs of these detectors have left."""
+    for home in (tempfile.gettempdir(), Path.home()):
         for file in Path(home).glob(f"{PREFIX}*"):
             file.unlink(missing_ok=True)
 
@@ -693,5 +663,5 @@ def sweep():
 def oodd_detectors():
     return [
         DetectorSpec(name, made, made.__doc__.splitlines()[0], deterministic=True)
-        for name, made in {**HONEST, **ADVERSARIES}.items()
+        for name, made in {BASE: Honest, **ADVERSARIES}.items()
     ]

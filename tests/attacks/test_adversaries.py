@@ -1,4 +1,4 @@
-"""Cheats in a re-run: each has the honest detector's figures, or none at all."""
+"""Cheats in sandboxes, row by row: each scores as the honest detector does, or fails."""
 
 import shutil
 
@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from helpers_plugins import install_adversaries
 from helpers_split import make_split
-from oodd_leaderboard.verify.rerun import differences
 
 from oodd_eval.data.split import load_split, split_places
 from oodd_eval.plugins.discovery import discover
@@ -20,33 +19,26 @@ from oodd_eval.scoring.runner import run
 pytestmark = pytest.mark.skipif(not shutil.which("bwrap"), reason="needs bubblewrap")
 
 ENVIRONMENT = "cartpole"
+HONEST_SCORES = ["sly-memorised", "sly-look-ahead", "sly-company-home", "sly-company-fit-map"]
 PLAYED = [
-    "sly-look-ahead", "sly-look-ahead-prefix", "sly-company-home", "sly-company-fit-map",
-    "sly-abstract-socket", "sly-calibration-first", "sly-burglar",
-    "sly-memorised", "sly-mapped-state", "sly-takes-over", "sly-answers-early",
+    *HONEST_SCORES, "sly-look-ahead-prefix", "sly-abstract-socket", "sly-process-number",
+    "sly-calibration-first", "sly-burglar", "sly-mapped-state", "sly-reads-ahead",
+    "sly-takes-over", "sly-answers-early",
 ]  # fmt: skip
 METRICS = ("auc_matched", "found_within_20_at_5pct")
 
 
-def play(home, names, directory, *, rerun):
-    """Run detectors on a split, as a plain run or as a re-run does; their records by name."""
-    split, output = load_split(directory), home / ("again" if rerun else "plain")
+def play(names, directory, output, *, boxed):
+    """Run detectors on a split, in sandboxes and row by row or not; their records by name."""
+    split = load_split(directory)
     plan = make_plan(
         discover(), split=split, detectors=names, environments=[ENVIRONMENT],
-        anomalies=["iid", "drift", "gravity"],
+        anomalies=["iid", "gravity"],
     )  # fmt: skip
-    hidden = (*split_places(split), str(output)) if rerun else None
-    settings = RunSettings(limits=Limits(300, 2 * 10**9, hidden), streamed=rerun)
+    hidden = (*split_places(split), str(output)) if boxed else None
+    settings = RunSettings(limits=Limits(300, 2 * 10**9, hidden), streamed=boxed)
     records = run(plan, split, discover(), settings, ResultsDirectory(output)).records
     return {name: [r for r in records if r.detector == name] for name in names}
-
-
-def splits(home):
-    """Return a published split, whose twins an adversary has in a table, and one of other seeds."""
-    sizes = {"train": 4, "calibration": 40, "test": 40}  # few groups
-    published = make_split(home / "published", (ENVIRONMENT,), **sizes, seed_base=11, name="one")
-    drawn = make_split(home / "drawn", (ENVIRONMENT,), **sizes, seed_base=12, name="other")
-    return published, drawn
 
 
 def table_of(directory):
@@ -60,39 +52,33 @@ def table_of(directory):
 
 @pytest.fixture(scope="module")
 def played(tmp_path_factory):
-    """Records in a re-run of all that play, and in a plain run of the memorising one."""
+    """Records of a plain run on a published split, and of a sandboxed one on other seeds."""
     home = tmp_path_factory.mktemp("adversaries")
-    published, drawn = splits(home)
+    sizes = {"train": 4, "calibration": 40, "test": 15}  # few groups
+    published, other = (
+        make_split(home / name, (ENVIRONMENT,), **sizes, seed_base=base, name=name)
+        for name, base in (("published", 11), ("other", 12))
+    )
     with pytest.MonkeyPatch.context() as patch:
         install_adversaries(patch, home / "plugin")
         (home / "plugin" / "oodd_adversaries_table.py").write_text(table_of(published))
-        again = play(home, [adversaries.BASE, *PLAYED], drawn, rerun=True)
-        plain = play(home, [adversaries.BASE, "sly-memorised"], published, rerun=False)
+        boxed = play([adversaries.BASE, *PLAYED], other, home / "boxed", boxed=True)
+        plain = play(["sly-memorised"], published, home / "plain", boxed=False)
     adversaries.sweep()
-    return plain, again
+    return plain, boxed
 
 
 @pytest.mark.parametrize("name", PLAYED)
-def test_a_cheat_gains_nothing_in_a_rerun(played, name):
-    _, again = played
-    for mine, honest in zip(again[name], again[adversaries.BASE], strict=True):
+def test_a_cheat_gains_nothing_in_a_sandbox(played, name):
+    _, boxed = played
+    for mine, honest in zip(boxed[name], boxed[adversaries.BASE], strict=True):
         assert honest.ok, honest.reason
         for metric in METRICS if mine.ok else ():
             assert mine.value(metric) <= honest.metrics[metric].high, (mine.anomaly, metric)
+        if name in HONEST_SCORES:
+            assert repr(mine.metrics["auc_matched"]) == repr(honest.metrics["auc_matched"])
 
 
-@pytest.mark.parametrize("name", ["sly-memorised", "sly-look-ahead", "sly-company-home"])
-def test_scores_of_a_rerun_are_those_of_the_honest_detector(played, name):
-    _, again = played
-    for mine, honest in zip(again[name], again[adversaries.BASE], strict=True):
-        assert repr(mine.metrics["auc_matched"]) == repr(honest.metrics["auc_matched"]), mine.reason
-
-
-def test_a_memorised_board_is_refused(played):
-    plain, again = played
-    claimed, honest = (plain[name] for name in ("sly-memorised", adversaries.BASE))
-    assert all(r.value("auc_matched") > 0.99 for r in claimed)
-    compared = differences({ENVIRONMENT: (claimed, again["sly-memorised"])})
-    assert any(d.refused and d.metric == "auc_matched" for d in compared)
-    compared = differences({ENVIRONMENT: (honest, again[adversaries.BASE])})
-    assert not any(d.refused for d in compared)
+def test_a_memorised_split_would_win_on_its_own_seeds(played):
+    plain, _ = played
+    assert all(r.value("auc_matched") > 0.99 for r in plain["sly-memorised"])
