@@ -974,7 +974,7 @@ def hostile_runs(size=6):
     return runs
 
 
-# Kills at random moments, and full disks. test_kills and test_transfer kill runs, builds, fetches.
+# Kills at random moments, and full disks. test_kills kills runs, builds and fetches.
 
 KILLED = {
     "run --sandbox": ("run", "-q", "--detector", "persistence,random", "--env", "cartpole",

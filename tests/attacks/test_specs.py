@@ -25,16 +25,13 @@ def oodd_detectors():
 """
 
 NAMES = {
-    "number": "5", "none": "None", "bytes": "b'x'", "empty": "''", "path": "'../../etc'",
-    "absolute": "'/etc/x'", "dots": "'..'", "newline": "'a\\nb'", "end": "'a\\n'",
-    "escape": "'\\x1b[31mred'", "null": "'a\\0'", "zero-width": "'r\\u200bf'",
-    "look-alike": "'\\u0440f'", "digits": "'\\u0661'", "capital": "'RF'", "long": "'x' * 300",
-    "space": "'r f'", "comma": "'a,b'", "glob": "'a*'", "slash": "'a/b'", "markup": "'<b>'",
-    "pipe": "'a|b'", "hyphen": "'-a'", "colon": "'a:'", "two-colons": "'a:B:C'",
-    "link": "'a:B](http://x)'", "right-to-left": "'\\u202ea'", "list": "['rf']",
+    "number": "5", "bytes": "b'x'", "empty": "''", "path": "'../../etc'", "end": "'a\\n'",
+    "escape": "'\\x1b[31mred'", "zero-width": "'r\\u200bf'", "look-alike": "'\\u0440f'",
+    "digits": "'\\u0661'", "capital": "'RF'", "long": "'x' * 300", "comma": "'a,b'",
+    "hyphen": "'-a'", "two-colons": "'a:B:C'", "list": "['rf']",
 }  # fmt: skip
 FIELDS = {
-    "factory": "'factory': 3", "factory-none": "'factory': None", "summary": "'summary': 3",
+    "factory": "'factory': 3", "summary": "'summary': 3",
     "summary-lines": "'summary': 'a\\nb'", "summary-escape": "'summary': '\\x1b]0;x\\x07'",
     "summary-long": "'summary': 'x' * 10**6", "reference": "'reference': b'x'",
     "inputs": "'inputs': 'labels'", "inputs-list": "'inputs': ['observations']",
@@ -42,8 +39,8 @@ FIELDS = {
     "other": "'other_parameters': 1", "decides": "'horizon_decides_fit': None",
     "requires": "'requires': 'torch'", "requires-numbers": "'requires': (3,)",
     "version": "'version': '1\\n2'", "version-path": "'version': '../1'", "fit": "'fit_name': 3",
-    "extra": "'extra': 'a\\rb'", "parameters": "'parameters': 3",
-    "parameters-dict": "'parameters': {'size': 3}", "parameters-names": "'parameters': Known",
+    "extra": "'extra': 'a\\rb'", "parameters": "'parameters': {'size': 3}",
+    "parameters-names": "'parameters': Known",
 }  # fmt: skip
 
 
@@ -111,23 +108,19 @@ RETURNED = {
     "text": "return [DetectorSpec(Text('odd'), Good, '')]",
     "summary": "return [DetectorSpec('odd', Good, Text('odd'))]",
     "inputs": "return [DetectorSpec('odd', Good, '', inputs=Text('observations'))]",
-    "alarm": "return [DetectorSpec('odd', Good, '', alarm=Text('cusum'))]",
     "requires": "return [DetectorSpec('odd', Good, '', requires=(Text('json'),))]",
     "subclass": "return [Spec('odd', Good, '')]",
     "no-spec": "return [Shown()]",
     "mute": "raise Mute",
     "metaclass": "raise MetaError",
     "exit": "sys.exit(Shown())",
-    "group": "raise BaseExceptionGroup('x', [SystemExit()])",
     "cancelled": "raise GeneratorExit",
     "parameters": "return [DetectorSpec('odd', Good, '', parameters=Odd)]",
-    "shown-parameters": "return [DetectorSpec('odd', Good, '', parameters=Shown())]",
     "default": "return [DetectorSpec('odd', Good, '', parameters=declared_by({'a': Shown()}))]",
     "text-default": "return [DetectorSpec('odd', Good, '', parameters=declared_by({'a': Text()}))]",
     "many-parameters": "return [DetectorSpec('odd', Good, '', parameters=declared_by("
     "dict.fromkeys(map('a{}'.format, range(999)))))]",
     "many": "return [DetectorSpec(f'odd-{i}', Good, '') for i in range(5000)]",
-    "huge": "return [DetectorSpec('odd', Good, 'x' * 10**8)]",
 }
 
 
@@ -141,29 +134,25 @@ def test_a_hook_that_stops_those_who_ask_breaks_its_plug_in(returns, monkeypatch
     assert "fine" not in out.split()
 
 
-@pytest.mark.parametrize("hook", ["oodd_environments", "oodd_anomalies", "oodd_readers"])
+@pytest.mark.parametrize(
+    "hook", ["oodd_environments", "oodd_anomalies", "oodd_readers", "oodd_detectors"]
+)
 @pytest.mark.parametrize("returned", ["Endless()", "endless()", "[Shown()]", "Text()"])
-def test_other_hooks_are_asked_in_the_same_way(hook, returned, monkeypatch, tmp_path):
+def test_what_is_no_list_of_specs_breaks_its_plug_in(hook, returned, monkeypatch, tmp_path):
     code = STOPS.replace("@RETURNS@", "return []")
+    if hook == "oodd_detectors":
+        code = code.partition("@hookimpl")[0]
     install(monkeypatch, tmp_path, "odd", f"{code}\n@hookimpl\ndef {hook}(): return {returned}\n")
     plugins = discover()
     if hook == "oodd_readers":
         plugins.offered_by(hook, Reader, check_reader)
     else:
         assert plugins.custom_specs is not None
-    assert [broken.plugin for broken in plugins.broken] == ["odd"]
-
-
-@pytest.mark.parametrize("returned", ["Endless()", "endless()", "Text()", "Shown()"])
-def test_what_is_no_list_is_not_read(returned, monkeypatch, tmp_path):
-    code = STOPS.replace('return [DetectorSpec("fine", Good, ""), *first()]', f"return {returned}")
-    install(monkeypatch, tmp_path, "odd", code.replace("@RETURNS@", "pass"))
-    plugins = discover()
     assert "clock" in plugins.offers
     assert [broken.plugin for broken in plugins.broken] == ["odd"]
 
 
-@pytest.mark.parametrize("raises", ["SystemExit", "RuntimeError", "KeyboardInterrupt"])
+@pytest.mark.parametrize("raises", ["SystemExit", "RuntimeError"])
 def test_what_is_required_is_not_imported(raises, monkeypatch, tmp_path, capsys):
     (tmp_path / "parent").mkdir()
     (tmp_path / "parent" / "__init__.py").write_text(f"raise {raises}")
@@ -176,15 +165,13 @@ def test_what_is_required_is_not_imported(raises, monkeypatch, tmp_path, capsys)
     assert "odd " in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("name", [5, "../../etc", "a\nb", "RF", "x" * 300])
+@pytest.mark.parametrize("name", [5, "a\nb"])
 def test_a_wrong_name_of_a_detector_of_ones_own(name, tiny_split):
     with pytest.raises(PluginError, match="name of a DetectorSpec is"):
         evaluate(DetectorSpec(name, object, ""), tiny_split)
 
 
-@pytest.mark.parametrize(
-    "name", ["a:B\\n", "a:../x", "a:" + "b" * 300, "a:b.c.d.e.f.g.h.i.j.k", "A:b", ":b"]
-)
+@pytest.mark.parametrize("name", ["a:B\\n", "a:" + "b" * 300, "a:b.c.d.e.f.g.h.i.j.k", ":b"])
 def test_a_wrong_name_made_for_a_colon(name, monkeypatch, tmp_path):
     code = f"""
         @hookimpl

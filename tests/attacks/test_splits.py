@@ -130,11 +130,8 @@ def negative_zero(file):
 
 LABELS = {
     "onsets below 0": (all_to("onsets", -1), "expected 0 <= onset <= effect"),
-    "onsets at the least number": (all_to("onsets", -(2**63)), "expected 0 <= onset <= effect"),
     "onsets past the end": (both_to(1000), "expected 0 <= onset <= effect <= 60"),
-    "effects past the end": (all_to("effects", 2**62), "expected 0 <= onset <= effect <= 60"),
     "effects before the onsets": (all_to("effects", 1), "expected 0 <= onset <= effect"),
-    "all onsets 0": (all_to("onsets", 0), "onset at row 0, expected 30 or a later row"),
     "all onsets and effects 0": (both_to(0), "onset at row 0, expected 30 or a later row"),
     "onsets too early": (both_to(30), "first differs from its twin at row"),
     "onsets too late": (both_to(59), "differ from its twin's before its onset"),
@@ -198,13 +195,6 @@ def external(file):
     file["train"].create_dataset("rewards", (1,), "<f4", external=[("/etc/passwd", 0, size)])
 
 
-def virtual(file):
-    del file["train/rewards"]
-    source = h5py.VirtualLayout((1,), "<f4")
-    source[:] = h5py.VirtualSource("/etc/passwd", "x", (1,))
-    file["train"].create_virtual_dataset("rewards", source)
-
-
 def offsets_of(*numbers):
     return replaced("offsets", lambda _: np.array(numbers, "<i8"), "train")
 
@@ -250,12 +240,9 @@ HDF5 = {
     "a soft link": (linked(h5py.SoftLink("/train/actions")), "points elsewhere: refused"),
     "an external link": (linked(h5py.ExternalLink("/etc/passwd", "/")), "points elsewhere"),
     "external content": (external, "keeps its content in another file"),
-    "virtual content": (virtual, "keeps its content in another file"),
     "a group in itself": (loop, "cannot be read|holds|lacks"),
     "a part without digest": (lambda f: f.create_group("test/none"), "holds the groups .*none"),
-    "a further dataset": (replaced("seeds", lambda a: a), None),
     "a dataset nobody knows": (lambda f: f["train"].create_dataset("x", data=[3]), "holds 'x'"),
-    "a scalar": (raw(shape=()), "made to fill"),
     "no room for what it has": (raw(shape=(10**10, 4), chunks=(10**4, 4)), "made to fill"),
     "chunks of gigabytes": (raw(shape=(10**9, 4), chunks=(10**8, 4)), "has chunks of 1600000000"),
     "a string of a gigabyte": (
@@ -314,18 +301,14 @@ def test_a_file_that_is_no_split_is_refused_in_little_memory(told, attack):
     stderr, found = told
     number, message = str([*HDF5].index(attack)), HDF5[attack][1]
     assert number in found, stderr[-1000:]
-    if message is None:
-        assert found[number] == ["opened"]
-        return
     assert found[number][0] == "refused"
     assert "cartpole.h5" in found[number][1]
     assert re.search(message, found[number][1]), found[number]
 
 
 IN_LOGS = (
-    "external content", "virtual content", "an external link", "no room for what it has",
-    "chunks of gigabytes", "a chunk that unpacks to 670 megabytes", "another filter", "a compound",
-    "a group for a dataset",
+    "external content", "an external link", "no room for what it has", "chunks of gigabytes",
+    "a chunk that unpacks to 670 megabytes", "another filter", "a group for a dataset",
 )  # fmt: skip
 
 
@@ -392,7 +375,6 @@ def verified(copy, monkeypatch):
 
 @pytest.mark.parametrize("change", [write_over, write_over_in_silence, cut])
 @pytest.mark.parametrize("read", [
-    lambda data: list(data.train), lambda data: data.twins[0],
     lambda data: data.anomalous("iid")[0], lambda data: data.train.returns,
     lambda data: data.anomalous("iid").rewards(0), lambda data: data.arrays("train"),
 ])  # fmt: skip
@@ -457,7 +439,6 @@ MANIFESTS = {
     "a sensor that steers a terminal": (edited(*ENTRY, "sensors", 0, "name", value="\x1b]0;x\x07"),
                                         "sensors.0.name: String should match"),
     "a path": (edited(*ENTRY, "file", value="/etc/passwd"), "file outside of the split"),
-    "a path in a folder": (edited(*ENTRY, "file", value="x/../../y"), "file outside of the split"),
     "no file name": (edited(*ENTRY, "file", value=""), "outside|is missing"),
 }  # fmt: skip
 
@@ -482,8 +463,6 @@ TEXTS = {
     "a number of many digits": defined("9" * 9000),
     "too long": lambda text: text + " " * 10**7,
     "a byte order mark": lambda text: "\ufeff" + text,
-    "a list": lambda text: f"[{text}]",
-    "nothing": lambda _: "",
     "a zero byte": lambda text: text.replace("tiny", "ti\\u0000ny"),
 }
 

@@ -1,6 +1,5 @@
-"""Entries that claim trust, or take another's row."""
+"""Entries that say more than they may, or take another's row."""
 
-import json
 import secrets
 import shutil
 
@@ -8,16 +7,7 @@ import pytest
 from helpers_split import make_split
 from helpers_submission import Draft
 from oodd_leaderboard import verify as verification
-from oodd_leaderboard.entry import (
-    GRANTS,
-    Grant,
-    digest_of,
-    read_entries,
-    read_entry,
-    read_grants,
-    sections,
-    write_grants,
-)
+from oodd_leaderboard.entry import read_entries, sections
 from oodd_leaderboard.submit import Statement, submit
 from oodd_leaderboard.verify import verify
 
@@ -64,108 +54,45 @@ def test_honest_entries_are_valid(rows, board):
     assert problems(board) == {}
 
 
-# A level of trust that an entry says of itself
+# Fields that an entry may not have
 
 CLAIMS = [
-    {"trust": "re-run"}, {"trust": "re-scored"}, {"trust": "reported"}, {"rerun": None},
-    {"rerun": {"by": "us", "how": "fresh seeds"}}, {"grant": {"trust": "re-run"}},
-    {"verified": True}, {"schema": 1, "trust": "re-run", "rerun": {"by": "us", "how": "it was"}},
+    {"trust": "re-run"}, {"rerun": {"by": "us", "how": "fresh seeds"}}, {"verified": True},
+    {"schema": 1, "trust": "re-run", "rerun": {"by": "us", "how": "it was"}},
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize("claim", CLAIMS, ids=lambda c: "-".join(c) + str(len(str(c))))
-def test_an_entry_cannot_claim_trust(rows, board, claim):
+def test_an_entry_cannot_say_that_it_was_verified(rows, board, claim):
     another(rows, board, "mine", of="random", **claim).write()
     assert "mine" in problems(board)
     with pytest.raises(ResultsError):
         read_entries(board)
 
 
-@pytest.mark.parametrize("name", [GRANTS, "results/trust.json", "scores/trust.json"])
-def test_grants_inside_an_entry_count_nothing(rows, board, name):
-    draft = another(rows, board, "mine", of="random")
-    draft.write()
-    digest = digest_of(draft.file("entry.json").read_bytes())
-    grants = {"mine": Grant(digest, "re-run", "me", "2026-11-23", "fresh seeds")}
-    file = draft.file(name)
-    file.parent.mkdir(exist_ok=True)
-    write_grants(board, grants)
-    (board.parent / GRANTS).rename(file)
-    assert "mine" in problems(board)
-    assert read_entry(draft.path).trust == "reported"
-
-
-# A grant of other numbers
-
-CHANGES = {
-    "caption": lambda draft: draft.entry.update(caption="better now"),
-    "submitter": lambda draft: draft.entry.update(submitter="Somebody else"),
-    "record": lambda draft: draft.records[0].update(peak_rss_mb=1.0),
-    "primary": lambda draft: draft.entry.update(primary=["random"]),
-}
-
-
-def test_records_that_are_not_those_of_the_grant_have_none(rows, board):
-    draft = another(rows, board, "mine", of="random")
-    draft.write()
-    digest = digest_of(draft.file("entry.json").read_bytes())
-    write_grants(board, {"mine": Grant(digest, "re-run", "us", "2026-11-23", "fresh seeds")})
-    assert read_entry(draft.path).trust == "re-run"
-    file = draft.file("records.jsonl")
-    file.write_text(file.read_text().replace('"peak_rss_mb": ', '"peak_rss_mb": 1', 1))
-    assert read_entry(draft.path).trust == "reported"
-
-
-@pytest.mark.parametrize("change", CHANGES)
-def test_a_changed_entry_has_lost_its_grant(rows, board, change):
-    draft = another(rows, board, "mine", of="random")
-    draft.write()
-    digest = digest_of(draft.file("entry.json").read_bytes())
-    write_grants(board, {"mine": Grant(digest, "re-run", "us", "2026-11-23", "fresh seeds")})
-    assert read_entry(draft.path).trust == "re-run"
-    assert problems(board) == {}
-    CHANGES[change](draft)
-    draft.write()
-    assert read_entry(draft.path).trust == "reported"
-    (found,) = problems(board).values()
-    assert "verify the entry and grant it again" in found[0]
-
-
-def test_a_grant_of_an_entry_that_is_not_there_is_refused(board):
-    write_grants(board, {"gone": Grant("0" * 64, "re-run", "us", "2026-11-23", "fresh seeds")})
-    assert "is of an entry.json that is not here" in str(problems(board))
-
-
 # Another's row
 
 
-def seeded(draft):
-    for record in draft.records:
-        record["seed"] = 99
-
-
 def forged(draft):
-    seeded(draft)
     for record in draft.records:
-        record["seconds_fit"] = 0.001
+        record |= {"seed": 99, "seconds_fit": 0.001}
 
 
 def half(draft):
     draft.records = draft.records[:8]
 
 
-@pytest.mark.parametrize("change", [lambda draft: None, seeded, forged, half])
+@pytest.mark.parametrize("change", [lambda draft: None, forged, half])
 def test_a_row_of_another_entry_is_refused(rows, board, change):
     draft = another(rows, board, "persistence-again")
     change(draft)
     draft.write()
-    assert any("is of a row of entry" in text for texts in problems(board).values()
-               for text in texts)  # fmt: skip
+    assert "is of a row of entry" in str(problems(board))
     with pytest.raises(ResultsError, match="both hold row 'persistence'"):
         sections(read_entries(board))
 
 
-@pytest.mark.parametrize("distribution", ["oodd-eval-x", "oodd-evil", "other"])
+@pytest.mark.parametrize("distribution", ["oodd-eval-x", "other"])
 def test_a_name_of_another_distribution_is_refused(rows, board, distribution):
     draft = another(rows, board, "mine")
     for record in draft.records:
@@ -179,7 +106,7 @@ def test_a_name_of_another_distribution_is_refused(rows, board, distribution):
 # Verification of a whole directory
 
 
-@pytest.mark.parametrize("error", [RecursionError, MemoryError, KeyError, AssertionError])
+@pytest.mark.parametrize("error", [RecursionError, MemoryError])
 def test_what_breaks_the_check_of_an_entry_does_not_end_that_of_others(
     rows, board, monkeypatch, error
 ):
@@ -198,18 +125,6 @@ def test_what_breaks_the_check_of_an_entry_does_not_end_that_of_others(
     (problem,) = found["aaa"].findings.problems
     assert f"could not be checked ({error.__name__}: " in problem.text
     assert "\x1b" not in problem.text
-
-
-@pytest.mark.parametrize("field", ["by", "how", "day"])
-@pytest.mark.parametrize("text", ["\x1b[2J", "a\u2028b", "\u202e"])
-def test_grants_are_plain_text(board, field, text):
-    write_grants(board, {"mine": Grant("0" * 64, "re-run", "us", "2026-11-23", "fresh seeds")})
-    file = board.parent / GRANTS
-    content = json.loads(file.read_text())
-    content["grants"]["mine"][field] = text
-    file.write_text(json.dumps(content))
-    with pytest.raises(ResultsError, match=f"{field}: .* no line of printable text"):
-        read_grants(board)
 
 
 # Seeds that can be found
