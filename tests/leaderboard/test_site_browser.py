@@ -237,7 +237,7 @@ def test_means_and_intervals_are_the_boards_for_every_selection(browser, entries
     assert compared == 3 * 3 * 2 * 6
 
 
-def test_filters_of_rows(browser):
+def test_filters_of_rows_anomalies_and_boards(browser):
     browser.choose("horizon", "Δ = 10")
     assert browser.texts(LABELS) == ["riqn[h=10]"]
     browser.choose("horizon", "All horizons")
@@ -245,6 +245,20 @@ def test_filters_of_rows(browser):
     assert browser.texts(LABELS) == ["riqn"]
     unfold(browser)
     assert browser.texts(LABELS) == ["riqn", "riqn[h=10]"]
+    # Anomalies to choose are those of the group.
+    browser.choose("group", "Sensor")
+    assert browser.texts("[name=anomaly] option") == ["All anomalies", "IID", "Sensor Drift"]
+    browser.choose("anomaly", "IID")
+    browser.choose("group", "Dynamics")
+    assert browser.run("return document.querySelector('[name=anomaly]').value") == "all"
+    # Ranks are those of all cells.
+    assert any("Ranks, tie groups and wins" in line for line in browser.texts("#notes li"))
+    browser.choose("group", "Both groups")
+    assert not any("Ranks" in line for line in browser.texts("#notes li"))
+    browser.choose("inputs", browser.texts("[name=inputs] option")[0])
+    browser.choose("board", "mini (cdcdcdcd), protocol 1")
+    assert browser.texts(LABELS) == ["rf"]
+    assert "digest cdcdcdcdcdcd" in browser.texts("#notes li")[0]
 
 
 def test_variants_stand_below_their_detectors_row(browser):
@@ -293,31 +307,10 @@ def test_the_table_as_csv_has_its_rows_and_no_formulas(browser):
     assert ",riqn" in lines[1]
 
 
-def test_the_anomalies_to_choose_are_those_of_the_group(browser):
-    browser.choose("group", "Sensor")
-    assert browser.texts("[name=anomaly] option") == ["All anomalies", "IID", "Sensor Drift"]
-    browser.choose("anomaly", "IID")
-    browser.choose("group", "Dynamics")
-    assert browser.run("return document.querySelector('[name=anomaly]').value") == "all"
-
-
-def test_ranks_are_said_to_be_those_of_all_cells(browser):
-    assert not any("Ranks" in line for line in browser.texts("#notes li"))
-    browser.choose("environment", "Hopper")
-    assert any("Ranks, tie groups and wins" in line for line in browser.texts("#notes li"))
-
-
-def test_boards_are_never_mixed(browser):
-    browser.choose("board", "mini (cdcdcdcd), protocol 1")
-    assert browser.texts(LABELS) == ["rf"]
-    assert "digest cdcdcdcdcdcd" in browser.texts("#notes li")[0]
-
-
 def test_failures_are_states_with_a_reason(browser):
     assert column(browser, "Matched AUC")["mine[window=3]"] == "timeout"
-    assert any(
-        "Not ranked: mine[window=3], timeout in 2 of 8" in t for t in browser.texts("#notes li")
-    )
+    notes = browser.texts("#notes li")
+    assert any("Not ranked: mine[window=3], timeout in 2 of 8" in note for note in notes)
     assert browser.run("return document.querySelector('td.state').title") == "not done after 5 s"
     browser.choose("group", "Dynamics")
     assert column(browser, "Matched AUC")["mine[window=3]"] != "timeout"
@@ -378,8 +371,8 @@ def test_the_address_says_what_is_shown(browser, url):
 @pytest.mark.parametrize(
     "wrong",
     [
-        *("?view=constructor", "?board=none", "?group=__proto__", "?sort=<b>", "?horizon=1e9"),
-        *("?anomaly=gravity&group=sensor", "?%E0%A4%A", "?trivial=", "detector/nobody", "<b>"),
+        *("?view=constructor&board=none&sort=<b>&horizon=1e9&trivial=", "?group=__proto__"),
+        *("?anomaly=gravity&group=sensor", "?%E0%A4%A", "detector/nobody", "<b>"),
     ],
 )
 def test_an_address_that_asks_for_what_is_not_there_is_a_table(browser, url, wrong):
@@ -439,6 +432,10 @@ def test_a_detectors_page_has_its_cells_and_curves(browser):
     ]
     assert "against" in browser.text("#cell > p")
     assert "from false alarms alone" in browser.text("#cell > p")
+    browser.click(".back a")
+    browser.wait_for("document.querySelector('#detector').hidden")
+    open_row(browser, "clock")
+    assert any("no curves for this cell" in t for t in browser.texts("#cell .note"))
 
 
 def test_curves_are_drawn_from_the_entrys_numbers(browser, entries):
@@ -487,11 +484,6 @@ def test_heat_shows_every_cell_of_a_row(browser, entries):
             assert next(shown) == show_value(value, "auc_matched")
 
 
-def test_a_row_without_curves_says_so(browser):
-    open_row(browser, "clock")
-    assert any("no curves for this cell" in t for t in browser.texts("#cell .note"))
-
-
 def test_comparisons_name_every_other_ranked_row(browser, entries):
     ranking = sections(entries)[0].ranks.ranking
     open_row(browser, "rf")
@@ -518,21 +510,22 @@ def test_the_papers_table_stands_beside_ours_where_it_has_digits(browser):
     assert browser.texts("#paper") == []
 
 
-def test_names_and_notes_are_text(browser):
+def test_names_and_notes_are_text_and_links_lead_out_only_when_followed(browser):
     open_row(browser, "mine[window=3]")
     assert "<b>bold</b>" in browser.texts("#source h3")
     assert browser.run("return document.querySelectorAll('#source b').length") == 0
     # An address of a script is shown, not linked.
     assert "javascript:alert(1)" in browser.texts("#source dd")
-    assert browser.run("return document.querySelector('#source a')") is None
-
-
-def test_links_lead_out_only_when_followed(browser):
+    link = "const a = document.querySelector('#source a'); return a && [a.href, a.rel]"
+    assert browser.run(link) is None
+    browser.run("history.back()")
+    browser.wait_for("document.querySelector('#detector').hidden")
     open_row(browser, "riqn")
-    link = browser.run(
-        "const a = document.querySelector('#source a'); return [a.href, a.rel]"
-    )  # fmt: skip
-    assert link == ["https://example.org/page", "noopener noreferrer external"]
+    assert browser.run(link) == ["https://example.org/page", "noopener noreferrer external"]
+    text = browser.text(".bibtex")
+    assert text.startswith("@misc{oodd-eval-forecasters,")
+    assert "author = {{A. Nonymous}}" in text
+    assert "Page 1954" in text
 
 
 @pytest.mark.parametrize("before", ["/hopper/iid", ""])
@@ -576,11 +569,6 @@ def test_weaker_anomalies_are_drawn_over_strength_and_over_their_cost(browser):
         assert browser.run(paths) != drawn
         focus = browser.run("return document.activeElement.name")
         assert focus == f"power-{control}"
-
-
-def test_rows_of_the_power_curves_can_be_left_out(browser):
-    browser.run("location.hash = '#/power'")
-    browser.wait_for("document.querySelector('#power') !== null")
     browser.run("document.querySelector('[name=power-row][value=rf]').click()")
     assert browser.texts("#power .legend li") == ["riqn", "trivial rows"]
     assert browser.run("return document.activeElement.value") == "rf"
@@ -724,14 +712,6 @@ def test_colours_follow_the_button_and_are_kept(browser, url):
         browser.run("localStorage.removeItem('oodd-theme')")
 
 
-def test_a_row_is_cited_by_its_entry(browser):
-    open_row(browser, "riqn")
-    text = browser.text(".bibtex")
-    assert text.startswith("@misc{oodd-eval-forecasters,")
-    assert "author = {{A. Nonymous}}" in text
-    assert "Page 1954" in text
-
-
 # -- all of it ------------------------------------------------------------------------------------
 
 
@@ -749,6 +729,19 @@ VIEWS = [
     "detector",
     "compare",
 ]
+
+
+NAMELESS = """
+    const named = (e) => e.getAttribute("aria-label") || e.textContent.trim();
+    const drawings = [...document.querySelectorAll("svg:not([aria-hidden])")]
+      .filter((e) => !named(e));
+    const tables = [...document.querySelectorAll("table:not(.numbers)")]
+      .filter((e) => !e.caption || e.querySelector("th:not([scope])"));
+    const titles = [...document.querySelectorAll("h1")].filter((e) => e.checkVisibility());
+    return [...drawings, ...tables].map((e) => e.outerHTML.slice(0, 200))
+      .concat(titles.length === 1 ? [] : [`${titles.length} titles`]);
+"""
+"""A script: what has no name and is not among what axe takes for serious."""
 
 
 def open_view(browser, url, view):
@@ -779,7 +772,7 @@ def test_every_page_can_be_read_at_every_width_and_in_every_colour(browser, url,
         for view in (*VIEWS, *cards):
             open_view(browser, url, view)
             assert browser.run(THEME) == theme
-            if lines := browser.defects(width):
+            if lines := browser.defects(width) + browser.run(NAMELESS):
                 defects[view] = lines
             browser.open(url)  # so that the next view finds the rows
             browser.wait_for("document.querySelector('[data-row]') !== null")
@@ -799,69 +792,7 @@ def test_the_reader_of_defects_sees_them(window, tmp_path):
     assert kinds == {"scrolls sideways", "broken", "color-contrast", "html-has-lang"}
 
 
-@pytest.mark.parametrize("view", VIEWS)
-def test_every_drawing_control_and_table_has_a_name(browser, url, view):
-    open_view(browser, url, view)
-    nameless = browser.run(
-        """
-        const named = (e) => e.getAttribute("aria-label") || e.textContent.trim() || e.title
-          || e.closest("label")?.textContent.trim();
-        const all = [...document.querySelectorAll(
-          "a, button, select, input, svg:not([aria-hidden])")].filter((e) => !named(e));
-        const tables = [...document.querySelectorAll("table:not(.numbers)")]
-          .filter((e) => !e.caption || e.querySelector("th:not([scope])"));
-        const boxes = [...document.querySelectorAll(".scroll")]
-          .filter((e) => e.scrollWidth > e.clientWidth && e.tabIndex < 0);
-        const titles = [...document.querySelectorAll("h1")].filter((e) => e.checkVisibility());
-        return [...all, ...tables, ...boxes].map((e) => e.outerHTML.slice(0, 200))
-          .concat(titles.length === 1 ? [] : [`${titles.length} titles`]);
-        """
-    )
-    assert nameless == []
-
-
-@pytest.mark.parametrize("theme", ["light", "dark"])
-@pytest.mark.parametrize("view", VIEWS)
-def test_texts_have_enough_contrast(browser, url, view, theme):
-    """At least 4.5 to 1 (WCAG AA) for every text, coloured cells included."""
-    open_view(browser, url, view)
-    try:
-        if browser.run(THEME) != theme:
-            browser.click("#theme")
-            browser.wait_for("!document.querySelector('[aria-busy], [role=status]')")
-        assert browser.run(THEME) == theme
-        found = browser.run(CONTRAST)
-        assert found["checked"] > 30
-        assert found["low"] == []
-    finally:
-        browser.run("localStorage.removeItem('oodd-theme')")
-
-
 THEME = "return document.documentElement.dataset.theme"
-
-CONTRAST = """
-    const rgb = (text) => text.match(/[\\d.]+/g).map(Number);
-    const light = ([r, g, b]) => [r, g, b].map((v) => v / 255)
-      .map((v) => v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4)
-      .reduce((sum, v, i) => sum + v * [0.2126, 0.7152, 0.0722][i], 0);
-    const back = (e) => {
-      for (; e; e = e.parentElement) {
-        const c = rgb(getComputedStyle(e).backgroundColor);
-        if (c.length < 4 || c[3] > 0) return c;
-      }
-      return [255, 255, 255];
-    };
-    const low = []; let checked = 0;
-    for (const e of document.querySelectorAll("body *:not(script):not(style):not(option)")) {
-      const own = [...e.childNodes].some((n) => n.nodeType === 3 && n.data.trim());
-      if (!own || !e.checkVisibility() || e.closest("svg") || e.closest("[aria-hidden]")) continue;
-      const [a, b] = [light(rgb(getComputedStyle(e).color)), light(back(e))];
-      const ratio = (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05);
-      checked += 1;
-      if (ratio < 4.5) low.push(`${e.textContent.trim().slice(0, 30)}: ${ratio.toFixed(2)}`);
-    }
-    return { checked, low };
-"""
 
 
 def test_the_policy_stops_requests(window, url):

@@ -150,10 +150,6 @@ def broken_neighbours(directory):
     return str(directory)
 
 
-def ascii_locale(**more):
-    return {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", **more}
-
-
 SURROUNDINGS = {
     "no home": lambda library, _: {
         "unset": ("HOME", "XDG_DATA_HOME", "OODD_EVAL_DATA"),
@@ -167,7 +163,7 @@ SURROUNDINGS = {
     "no locks: ENOSYS": lambda library, _: {
         "LD_PRELOAD": library(), "NO_LOCKS": str(errno.ENOSYS)
     },
-    "ascii": lambda *_: ascii_locale(),
+    "ascii": lambda *_: {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"},
     "latin-1": lambda *_: {"PYTHONIOENCODING": "latin-1"},
     "no columns": lambda *_: {"COLUMNS": "0"},
     "few columns": lambda *_: {"COLUMNS": "20"},
@@ -195,13 +191,9 @@ def test_a_run_is_done_and_printed_again(surroundings, split, tmp_path):
 
 OTHERS = {
     "list detectors": "mewma",
-    "list splits": "standard",
-    "info cartpole": "cart position",
     "info mewma": "shrinkage",
     "data verify SPLIT": "12 of 12 groups",
-    "data info SPLIT": "CartPole",
     "leaderboard show": "oracle",
-    "show OUT --split SPLIT": "CartPole",
     "show OUT --split SPLIT --markdown": "CartPole",
     "check range": "29 checks",
 }
@@ -363,6 +355,7 @@ def cgroups(root, lines, files):
 
 V2 = "0::/batch/job\n"
 V1 = "3:pids:/job\n2:cpu,cpuacct:/job\n1:name=systemd:/\n"
+QUOTA, PERIOD = "cpu,cpuacct/job/cpu.cfs_quota_us", "cpu,cpuacct/job/cpu.cfs_period_us"
 SHARES = {
     "none": ("", {}, 2),
     "of the job": (V2, {"batch/job/cpu.max": "100000 100000"}, 1),
@@ -371,20 +364,11 @@ SHARES = {
     "larger than the machine": (V2, {"batch/job/cpu.max": "99900000 100000"}, 2),
     "smaller than a core": (V2, {"batch/job/cpu.max": "1000 100000"}, 1),
     "no numbers": (V2, {"batch/job/cpu.max": "some 100000"}, 2),
-    "version 1": (
-        V1,
-        {"cpu,cpuacct/job/cpu.cfs_quota_us": "120000",
-         "cpu,cpuacct/job/cpu.cfs_period_us": "100000"},
-        1,
-    ),
-    "version 1 without a limit": (
-        V1,
-        {"cpu,cpuacct/job/cpu.cfs_quota_us": "-1", "cpu,cpuacct/job/cpu.cfs_period_us": "100000"},
-        2,
-    ),
+    "version 1": (V1, {QUOTA: "120000", PERIOD: "100000"}, 1),
+    "version 1 without a limit": (V1, {QUOTA: "-1", PERIOD: "100000"}, 2),
     "processes": (V1, {"pids/job/pids.max": "20"}, 1),
     "processes without a limit": (V2, {"batch/job/pids.max": "max"}, 2),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", SHARES)
