@@ -11,10 +11,6 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-# A slow machine is no error.
-settings.register_profile("tests", deadline=None)
-settings.load_profile("tests")
-
 # Two workers on two cores: numerical libraries get one thread each.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
@@ -24,6 +20,10 @@ sys.path.insert(0, str(Path(__file__).parent))
 from helpers_split import make_split
 
 TESTS = Path(__file__).parent
+
+# A slow machine is no error.
+settings.register_profile("tests", deadline=None)
+settings.load_profile("tests")
 
 # Until the tests are collected, nothing is garbage. `pytest_collection_finish` ends this.
 gc.disable()
