@@ -72,6 +72,9 @@ def test_off_unless_asked_and_nothing_of_the_harness_is_imported(run, pytester):
     result.assert_outcomes(passed=1)
     assert "oodd-eval::" not in result.stdout.str()
     assert not result.stderr.str()
+    result = run("--oodd-reference", os.devnull)
+    assert result.ret == pytest.ExitCode.USAGE_ERROR
+    result.stderr.fnmatch_lines(["ERROR: --oodd-reference needs --oodd-detector, the name of *"])
 
 
 def test_equal_figures_pass_beside_the_repositorys_own_tests(run, pytester, reference):
@@ -158,7 +161,7 @@ def test_a_new_cell_is_skipped(cells, reference, tmp_path):
         own.check(cell, None)
 
 
-def test_environments_horizons_and_seeds_are_those_of_the_reference(cells, reference, tmp_path):
+def test_cells_are_those_of_the_reference(cells, reference, tmp_path):
     own = [r for r in read_record_set(reference).records if r.environment == "hopper"]
     write_reference([replace(r, horizon=10, seed=3) for r in own], tmp_path / "r.jsonl")
     found = cells(oodd_reference=str(tmp_path / "r.jsonl")).names
@@ -170,6 +173,7 @@ def test_environments_horizons_and_seeds_are_those_of_the_reference(cells, refer
     ("options", "message"),
     [
         ({"oodd_detector": "persistenc"}, "unknown detector 'persistenc': did you mean 'persis"),
+        ({"oodd_detector": "bad"}, "plug-in 'bad' is broken: ModuleNotFoundError"),
         ({"oodd_detector": "clock"}, "only others, such as .*persistence"),
         ({"oodd_reference": "none.jsonl"}, "no results or reference at 'none.jsonl'"),
         ({"oodd_split": "mini"}, r"nothing in common: .* has split tiny, digest .*, expected"),
@@ -179,18 +183,9 @@ def test_environments_horizons_and_seeds_are_those_of_the_reference(cells, refer
         ({"oodd_fail": ["auc:+1"]}, "higher is better"),
     ],
 )
-def test_what_cannot_be_done_is_a_usage_error(cells, reference, options, message):
+def test_what_cannot_be_done_is_a_usage_error(
+    cells, reference, monkeypatch, tmp_path, options, message
+):
+    install(monkeypatch, tmp_path, "bad", "import no_such")
     with pytest.raises(pytest.UsageError, match=message):
         cells(**{"oodd_reference": str(reference)} | options)
-
-
-def test_a_broken_plugin_is_named_when_a_detector_is_unknown(cells, monkeypatch, tmp_path):
-    install(monkeypatch, tmp_path, "bad", "import no_such")
-    with pytest.raises(pytest.UsageError, match="plug-in 'bad' is broken: ModuleNotFoundError"):
-        cells(oodd_detector="bad")
-
-
-def test_options_without_a_detector_are_a_usage_error(run):
-    result = run("--oodd-reference", os.devnull)
-    assert result.ret == pytest.ExitCode.USAGE_ERROR
-    result.stderr.fnmatch_lines(["ERROR: --oodd-reference needs --oodd-detector, the name of *"])

@@ -111,13 +111,6 @@ def test_a_conforming_detector_is_exit_code_0_with_a_line_per_check(check):
     assert max(map(len, out.splitlines())) <= 80
 
 
-def test_a_failure_may_be_expected(check):
-    arguments = ["clock", "-k", "anomaly", "--expect", "gross-anomaly=it is a clock"]
-    code, out, _ = check(*arguments)
-    assert code == 0
-    assert "it is a clock [an episode" in " ".join(out.split())
-
-
 def test_messages_of_a_detector_are_made_fit_to_print(check):
     assert 'raise RuntimeError("no mood")' in check("raises", "-v", "-k", "fits")[1]
     code, out, err = check("ugly", "-v", "-k", "fits")
@@ -127,7 +120,10 @@ def test_messages_of_a_detector_are_made_fit_to_print(check):
     assert len(out) < 10_000
 
 
-def test_horizon_and_parameters_reach_the_detector(check):
+def test_expected_failures_horizon_and_parameters_reach_the_checks(check):
+    code, out, _ = check("clock", "-k", "anomaly", "--expect", "gross-anomaly=it is a clock")
+    assert code == 0
+    assert "it is a clock [an episode" in " ".join(out.split())
     code, out, _ = check("fine", "--horizon", "1,7", "--param", "power=2", "-k", "scores")
     assert code == 0
     assert [line for line in out.splitlines() if line.startswith("fine")] == [

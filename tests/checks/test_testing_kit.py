@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from broken_detectors import BROKEN, ENDS, GOOD, STARTED, Good
-from oodd_checks.conformance import CheckReport, Result
+from oodd_checks.conformance import CheckReport
 from oodd_checks.conformance.session import CHECKS, run_tests
 from oodd_checks.conformance.trial import Trial
 from oodd_checks.testing import NonConformingError, run_checks
+from oodd_trivial import Clock
 
 from oodd_eval import check_detector
 
@@ -109,25 +110,6 @@ def test_check_detector_raises_what_failed(capsys):
     assert "FAILED   gross-anomaly" in capsys.readouterr().out
 
 
-def test_expected_failures_are_all_right_where_they_fail_or_do_not_apply():
-    class Clock:
-        def __init__(self, *, seed=0, horizon=1): ...
-
-        def fit(self, nominal): ...
-
-        def score(self, x):
-            return np.arange(len(x), dtype=np.float64)
-
-    expected_failures = {"state": "none", "gross-anomaly": "on purpose"}
-    report = run_checks(Clock, expected_failures=expected_failures)
-    results = {r.name: r for r in report.results}
-    assert report.ok, report
-    assert results["state"].status == "skipped"
-    assert results["gross-anomaly"].status == "xfailed"
-    assert results["gross-anomaly"].message.startswith("on purpose [an episode")
-    assert "1 failed as expected" in report.summary()
-
-
 class Bare:
     """No seed, no horizon, and scores in a list."""
 
@@ -150,23 +132,19 @@ def test_a_class_with_fit_and_score_alone_is_checked_like_any_other(detector):
     assert {"factory", "fits", "scores", "horizon", "prefix", "same-seed", "order"} <= passed
 
 
-def test_an_expected_failure_that_passes_is_a_failure():
-    report = run_checks(GOOD, expected_failures={"order": "a guess"})
-    assert not report.ok
+def test_expected_failures_are_all_right_where_they_fail_or_do_not_apply_alone():
+    reasons = {"state": "none", "gross-anomaly": "on purpose", "order": "a guess"}
+    report = run_checks(Clock, expected_failures=reasons)
+    results = {r.name: r for r in report.results}
+    assert results["state"].status == "skipped"
+    assert results["gross-anomaly"].status == "xfailed"
+    assert results["gross-anomaly"].message.startswith("on purpose [an episode")
+    # One that passes is a failure.
     assert [(r.name, r.status) for r in report.failed] == [("order", "xpassed")]
-    assert "1 passed unexpectedly" in report.summary()
     assert "a guess" in report.failed[0].message
-
-
-def test_a_report_counts_every_status():
-    statuses = ("passed", "failed", "skipped", "xfailed", "xpassed")
-    report = CheckReport([Result(s, s, seconds=0.2) for s in statuses])
-    assert report.summary() == (
-        "5 checks: 1 passed, 1 failed, 1 skipped, 1 failed as expected, 1 passed unexpectedly "
-        "in 1.0 s"
-    )
-    assert not report.ok
-    assert CheckReport([]).summary() == "0 checks: none ran in 0.0 s"
+    for text in ("1 failed as expected", "1 passed unexpectedly", "1 skipped"):
+        assert text in report.summary()
+    assert "0 checks" in CheckReport([]).summary()
 
 
 def test_what_needs_more_than_there_is_names_the_check_to_look_at():
@@ -202,12 +180,9 @@ def test_checks_leave_the_process_as_it_was(tmp_path, monkeypatch):
 
     before = state()
     run_checks(GOOD)
+    run_checks(BROKEN["network-PhonesHome"].spec)
     assert before == state()
     assert list(tmp_path.iterdir()) == []
-
-
-def test_the_network_works_again_after_a_check():
-    run_checks(BROKEN["network-PhonesHome"].spec)
     with socket.create_server(("127.0.0.1", 0)) as server:
         socket.create_connection(server.getsockname()).close()
 

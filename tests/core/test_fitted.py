@@ -128,12 +128,8 @@ def test_fresh_fits_again_and_keeps_that(tiny_split, log, tmp_path):
     assert log() == ["fit", "fit"]
     go(tiny_split, tmp_path / "out", horizons=(3,))
     assert log() == ["restore"]
-
-
-def test_fresh_fits_once_what_the_units_of_a_run_share(tiny_split, log, tmp_path):
-    go(tiny_split, tmp_path / "out", anomalies=("iid",))
-    log()
-    go(tiny_split, tmp_path / "out", anomalies=("iid",), horizons=(1, 2), fresh=True)
+    # Once for what the units of a run share.
+    go(tiny_split, tmp_path / "out", horizons=(1, 2), fresh=True)
     assert log() == ["fit", "restore"]
 
 
@@ -170,11 +166,7 @@ def test_a_detector_that_cannot_restore_itself_is_fitted(tiny_split, log, tmp_pa
     _, done = go(tiny_split, tmp_path / "out", ("forgets",), anomalies=("drift",))
     assert log() == ["fit", "fit"]
     assert done.records[0].ok
-
-
-def test_a_fit_of_the_same_run_that_cannot_be_restored_is_made_again(tiny_split, log, tmp_path):
-    _, done = go(tiny_split, tmp_path / "out", ("forgets",), anomalies=("iid",), horizons=(1, 2),
-                 fresh=True)  # fmt: skip
+    _, done = go(tiny_split, tmp_path / "new", ("forgets",), anomalies=("iid",), horizons=(1, 2))
     assert log() == ["fit", "fit"]
     assert [r.status for r in done.records] == ["ok", "ok"]
 

@@ -6,7 +6,6 @@ Each ends in a named state, the cells of the others are finished, and nothing is
 import json
 import os
 import re
-import shutil
 import subprocess
 import sys
 import time
@@ -45,22 +44,6 @@ QUICK = {
     "segfault": ("def score(self, x): ctypes.string_at(0)",
                  "error", "the worker was killed by SIGSEGV while scoring"),
     "sysexit": ("def score(self, x): sys.exit(0)", "error", r"called sys.exit\(0\)"),
-    "wrongshape": ("def score(self, x): return super().score(x)[:, None]",
-                   "invalid", r"returned an array of shape \(\d+, 1\)"),
-    "ahead": ("""
-        def score(self, x): return np.convolve(super().score(x), np.ones(9) / 9, mode="same")""",
-              "invalid", r"not those of its twin"),
-    "lazy": ("""
-        def score_many(self, xs):
-            return (self.score(x) if i < 1 else 1 / 0 for i, x in enumerate(xs))""",
-             "error", "ZeroDivisionError"),
-    "mapped": ("""
-        def score(self, x):
-            path = Path(f"/tmp/{os.getpid()}.scores")
-            found = np.memmap(path, np.float64, "w+", shape=(len(x),))
-            os.truncate(path, 0); path.unlink()
-            return found""",
-               "error", "the worker was killed by SIGBUS while scoring"),
     "pipe": ("""
         def score(self, x):
             for descriptor in range(3, 64):
@@ -77,14 +60,10 @@ QUICK = {
                 os._exit(0)
             os._exit(3)""",
                "error", "the worker ended with exit code 3 while fitting"),
-    "sabotage": ("def fit(self, nominal): builtins.isinstance = builtins.len = None",
-                 "error", "the worker ended with exit code 1 while |TypeError"),
     "grows": ("""
         def score(self, x):
             self.rows = np.ones(6 * 10**7); time.sleep(600)""",
               "oom", r"resident memory \d+ MB is over the limit of 300 MB \(--memory\)"),
-    "huge": ("def score(self, x): return np.broadcast_to(1.0, 10**12)",
-             "invalid", r"score returned an array of shape \(10{12},\), expected \(\d+,\): one"),
     "speechless": ("""
         class Odd(Exception):
             def __str__(self): raise ValueError("no words")
@@ -117,14 +96,6 @@ QUICK = {
                  "error", "the worker was killed by signal 40 while scoring"),
     "scored": ("def score(self, x): os._exit(93)",
                "error", "the worker closed its pipe while scoring, without a result"),
-    "leaves": ("""
-        def fit(self, nominal):
-            subprocess.Popen(["sleep", "600"], start_new_session=True)""",
-               "incompatible", "processes run on after fit"),
-    "threads": ("""
-        def fit(self, nominal):
-            for _ in range(50): threading.Thread(target=time.sleep, args=(600,)).start()""",
-                "incompatible", "threads or processes run on after fit"),
 }  # fmt: skip
 
 UNMARKED = f"600.{os.getpid()}"
@@ -205,27 +176,6 @@ def hostile(tiny_split, tmp_path_factory):
     return quick, hanging, left_running()
 
 
-@pytest.mark.skipif(not shutil.which("bwrap"), reason="needs bubblewrap")
-def test_a_hostile_plugin_in_a_sandbox_ends_in_its_state_too(tiny_split, tmp_path, monkeypatch):
-    ends = ("segfault", "sysexit", "orphan", "stateless")
-    for name in ends:
-        code = f"class Hostile(Base):\n{indented(QUICK[name][0])}\n"
-        install(monkeypatch, tmp_path / "plugins", name, code, header=HEADER)
-    done = subprocess.run(
-        [sys.executable, "-m", "oodd_eval", "run", "--detector", ",".join(ends), "--env",
-         "cartpole", "--anomaly", "iid", "--split", tiny_split, "--output", tmp_path / "out",
-         "--sandbox"],
-        env={**os.environ, "PYTHONPATH": str(tmp_path / "plugins")},
-        capture_output=True, text=True, check=False, timeout=300,
-    )  # fmt: skip
-    assert done.returncode == 1, done.stderr
-    lines = (tmp_path / "out" / "records.jsonl").read_text().splitlines()
-    for record in map(json.loads, lines):
-        _, status, reason = QUICK[record["detector"]]
-        assert record["status"] == status, record["reason"]
-        assert re.search(reason, record["reason"])
-
-
 def indented(body):
     lines = body.strip("\n").splitlines()
     margin = len(lines[0]) - len(lines[0].lstrip())
@@ -242,6 +192,7 @@ def test_a_hostile_plugin_ends_in_its_state(hostile, name):
     found = cells(hostile[0][1], name)
     assert [record["status"] for record in found] == [status] * 2, found[0]["reason"]
     assert all(re.search(reason, r["reason"]) for r in found)
+    assert len(found[0]["reason"]) <= LONGEST_REASON
 
 
 @pytest.mark.parametrize("name", HANGING)
@@ -252,42 +203,24 @@ def test_a_hanging_plugin_is_ended_by_the_time_limit(hostile, name):
     ] * 2
 
 
-def test_the_exit_code_is_1_and_every_other_cell_is_finished(hostile):
-    (quick, records), (hanging, hung), _ = hostile
+def test_every_other_cell_is_finished_and_nothing_reaches_the_output_or_is_left(hostile):
+    (quick, records), (hanging, hung), left = hostile
     assert quick.returncode == hanging.returncode == 1, quick.stderr
     assert len(records) == 2 * (len(QUICK) + 1)
     assert len(hung) == 2 * len(HANGING)
     assert [record["status"] for record in cells(records, "clock")] == ["ok"] * 2
-
-
-def test_nothing_that_a_plugin_printed_reaches_the_output(hostile):
-    for done, _ in hostile[:2]:
+    # Trajectories of the worker are copies: the scores of the others are as they would be.
+    assert cells(records, "scribbles")[0]["metrics"] == cells(records, "forks")[0]["metrics"]
+    for done in (quick, hanging):
         assert "garbage" not in done.stdout + done.stderr
         assert "\x1b" not in done.stdout
-
-
-def test_a_reason_is_one_line_of_bounded_length(hostile):
-    (reason,) = {record["reason"] for record in cells(hostile[0][1], "wordy")}
-    assert len(reason) <= LONGEST_REASON
-    assert len(hostile[0][0].stdout) < 20_000
-
-
-def test_what_a_detector_does_to_its_trajectories_stays_with_it(hostile):
-    """Trajectories of the worker are copies: the scores of the others are as they would be."""
-    found = {name: cells(hostile[0][1], name) for name in ("scribbles", "forks")}
-    assert found["scribbles"][0]["metrics"] == found["forks"][0]["metrics"]
-
-
-def test_plugins_that_kill_hang_or_fail_at_import_do_not_touch_runs_of_others(hostile):
-    for done, _ in hostile[:2]:
+        assert len(done.stdout) < 20_000
+        # Plug-ins that kill, hang or fail at import do not touch runs of others.
         assert "atimport" not in done.stderr
+    assert left == []
 
 
 def test_the_page_about_isolation_tells_every_state():
     page = (Path(__file__).parents[2] / "docs" / "isolation.md").read_text()
     told = re.findall(r"^\| `(\w+)` \| ", page, re.MULTILINE)
     assert ("ok", *told) == STATUSES
-
-
-def test_no_process_is_left_behind(hostile):
-    assert hostile[2] == []

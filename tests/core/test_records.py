@@ -146,7 +146,7 @@ def results(tmp_path):
 
 def test_scores_are_read_back_bit_for_bit(results):
     # Further parts are added to earlier ones.
-    results.write_scores("key", ScoreFile({"test/drift": [np.array([5.0])]}, {}))
+    results.write_scores("key", ScoreFile({"test/drift": [np.array([5.0])]}, SCORES.cost))
     read = results.scores("key", {**LENGTHS, "test/drift": [1]})
     assert read.cost == SCORES.cost
     for part, sequences in SCORES.parts.items():
