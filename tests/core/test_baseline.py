@@ -59,21 +59,15 @@ def test_an_episode_is_brought_to_trainings_by_hand():
     factor = np.sqrt(0.5) / np.sqrt((4 + 0.5) / 2)
     expected = np.array([[0.0], [3.0]]) * factor + 3.5
     np.testing.assert_allclose(judged.observations, expected, rtol=1e-6)
-
-
-def test_a_sensor_that_stands_still_is_moved_but_not_stretched():
+    # A sensor that stands still is moved but not stretched.
     base = Baseline.fit([Trajectory([[2.0], [2.0], [2.0]])], 2)
     judged = base.judged(Trajectory([[7.0], [7.0], [7.0], [8.0]]))
     assert judged.observations.ravel().tolist() == [2.0, 3.0]
-
-
-def test_machines_that_differ_by_a_shift_look_alike():
+    # Machines that differ by a shift look alike.
     train = [Trajectory(log_episode(i).observations) for i in range(5)]
-    base = Baseline.fit(train, B)
-    x = train[0]
-    moved = Trajectory(x.observations + np.float32(40.0))
-    judged, alike = base.judged(x), base.judged(moved)
-    np.testing.assert_allclose(alike.observations, judged.observations, atol=1e-4)
+    base, moved = Baseline.fit(train, B), Trajectory(train[0].observations + np.float32(40.0))
+    both = [base.judged(x).observations for x in (train[0], moved)]
+    np.testing.assert_allclose(*both, atol=1e-4)
 
 
 @pytest.mark.parametrize("rows", [B, B - 5])

@@ -66,9 +66,7 @@ def test_cusum_by_hand():
     statistic, alarms = cusum(x, drift=0.25, threshold=1.5)
     assert statistic.tolist() == [0, 0.75, 0.5, 1.75, 0.25, 0]
     assert alarms.tolist() == [False, False, False, True, False, False]
-
-
-def test_an_alarm_needs_more_than_the_threshold():
+    # An alarm needs more than the threshold.
     assert not cusum(np.array([1.0]), drift=0.0, threshold=1.0)[1].any()
 
 

@@ -75,15 +75,10 @@ def test_an_order_is_json_and_gives_the_scores_of_a_local_unit(job, tiny_split):
     }
 
 
-def test_limits_travel_with_the_order(job, tiny_split):
+def test_limits_travel_with_the_order_and_work_that_nobody_waits_for_is_given_up(job, tiny_split):
     found = ordered(job, tiny_split, Limits(seconds=0.001, memory=10**10))
     assert (found["status"], found["reason"]) == ("timeout", "not done after 0.001 s (--timeout)")
-
-
-def test_work_that_nobody_waits_for_is_given_up(job, tiny_split):
-    stop = threading.Event()
-    stop.set()
-    found = ordered(job, tiny_split, stop=stop.is_set)
+    found = ordered(job, tiny_split, stop=lambda: True)
     assert (found["status"], found["reason"]) == ("error", "interrupted")
 
 
