@@ -34,30 +34,19 @@ def visible(name, trajectories):
 
 
 @pytest.mark.parametrize("name", NETWORKS)
-def test_a_fit_made_on_the_device_scores_alike_there_and_on_the_processor(name, hopper):
+def test_a_fit_made_on_the_device_scores_alike_there_streamed_and_on_the_processor(name, hopper):
     detector = unfitted(name, "cuda")
     detector.fit(visible(name, hopper.train[:8]))
-    episodes = visible(name, hopper.twins[:3])
-    scores = [detector.score(x) for x in episodes]
-    state = pack(detector.state()).state()
     processor = unfitted(name, "cpu")
-    processor.restore(state)
-    for episode, score in zip(episodes, scores, strict=True):
+    processor.restore(pack(detector.state()).state())
+    for episode in visible(name, hopper.twins[:3]):
+        score = detector.score(episode)
         np.testing.assert_allclose(processor.score(episode), score, rtol=5e-3, atol=5e-3)
-
-
-@pytest.mark.parametrize("name", NETWORKS)
-def test_a_streamed_episode_has_its_scores(name, hopper):
-    detector = unfitted(name, "cuda")
-    detector.fit(visible(name, hopper.train[:8]))
-    episode = visible(name, hopper.twins[:1])[0][:60]
     detector.reset()
     actions = [None, *episode.actions]
-    streamed = [
-        detector.update(row, action)
-        for row, action in zip(episode.observations, actions, strict=True)
-    ]
-    np.testing.assert_allclose(streamed, detector.score(episode), rtol=5e-3, atol=5e-3)
+    rows = zip(episode.observations, actions, strict=True)
+    streamed = [detector.update(row, action) for row, action in rows]
+    np.testing.assert_allclose(streamed, score, rtol=5e-3, atol=5e-3)
 
 
 @pytest.mark.parametrize("name", ["riqn", "pe-a"])

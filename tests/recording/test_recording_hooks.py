@@ -81,12 +81,6 @@ def test_a_column_without_sense_is_refused(options, message):
         Quantity("level", "m", **options)
 
 
-def test_roles_and_noise_are_stored_in_the_split_and_read_back(cistern):
-    assert build("mine", "--strength", "offset=0.3") == 0
-    split = load_split("mine")
-    assert split.environment("cistern").sensors == cistern.SENSORS
-
-
 def test_noise_in_shares_of_the_spread_adds_to_the_table_in_squares(cistern):
     policy = load_policy("cistern")
     measure("cistern", policy)
@@ -98,6 +92,9 @@ def test_noise_in_shares_of_the_spread_adds_to_the_table_in_squares(cistern):
     expected = np.sqrt(0.01**2 + (0.5 * spread_of("cistern")[0]) ** 2)
     assert noise[:, 0].std() == pytest.approx(expected, rel=0.25)  # of 121 draws
     assert not noise[:, 2].any()
+    # Faults of the benchmark corrupt measured columns alone.
+    chosen = {int(choose_sensors("cistern", np.random.default_rng(i))[0]) for i in range(50)}
+    assert chosen == {0, 1}
 
 
 def test_a_fault_of_a_column_that_no_sensor_measures_is_refused_by_name(cistern):
@@ -109,12 +106,6 @@ def test_a_fault_of_a_column_that_no_sensor_measures_is_refused_by_name(cistern)
 
 def askew(strength, rng, simulator):
     return SensorFault(np.array([0, 2]), lambda x, _: x + strength)
-
-
-def test_faults_of_the_benchmark_corrupt_measured_columns_alone(cistern):
-    measure("cistern", load_policy("cistern"))
-    chosen = {int(choose_sensors("cistern", np.random.default_rng(i))[0]) for i in range(50)}
-    assert chosen == {0, 1}
 
 
 # Controllers with memory
@@ -185,11 +176,6 @@ def test_controllers_may_reuse_their_arrays(cistern):
 # Actions in physical units
 
 
-def test_the_limits_of_actions_are_those_of_the_box(cistern):
-    assert info_of("cistern").limits == ((0.0,), (8.0,))
-    assert ENVIRONMENTS["hopper"].limits == ((-1.0,) * 3, (1.0,) * 3)
-
-
 def drawn(kind, strength):
     simulator = make("cistern")
     simulator.reset(SEED)
@@ -217,6 +203,8 @@ def test_strengths_of_commands_are_shares_of_half_the_range_and_stay_within(cist
 
 def test_trained_policies_command_in_the_units_of_the_environment(cistern):
     info, actions = info_of("cistern"), np.array([[-1.0], [-0.5], [0.0], [1.0]], np.float32)
+    assert info.limits == ((0.0,), (8.0,))  # of the box
+    assert ENVIRONMENTS["hopper"].limits == ((-1.0,) * 3, (1.0,) * 3)
     np.testing.assert_array_equal(scaled(actions, info)[:, 0], [0, 2, 4, 8])
     zero = np.array([-0.0], np.float32)
     assert np.signbit(scaled(zero, ENVIRONMENTS["hopper"]))[0]  # not even a sign changes
@@ -347,7 +335,12 @@ def test_intermittent_kinds_of_ones_own_are_listed_and_recorded(cistern, capsys)
     assert main(["list", "anomalies"]) == 0
     assert "offset-intermittent" in capsys.readouterr().out
     assert build("mine", "--strength", "offset-intermittent=0.5") == 0
-    data = load_split("mine").environment("cistern")
+    split = load_split("mine")
+    data = split.environment("cistern")
+    assert data.sensors == cistern.SENSORS  # roles and noise are stored
+    versions = split.manifest["versions"]
+    assert set(versions) == {"oodd-eval", "numpy", "gymnasium", "click", "python"}
+    assert versions["click"] == version("click")
     part = data.anomalous("offset-intermittent")
     # The sensor lies inside the loop: between pulses rows are those of the simulator, again.
     episode, onset = part[0], part.onsets[0]
@@ -374,9 +367,6 @@ def test_intermittent_kinds_of_ones_own_are_listed_and_recorded(cistern, capsys)
 def test_rows_of_a_fault_that_make_no_sense_are_refused(options, message):
     with pytest.raises(PluginError, match=message):
         check_spec(AnomalySpec("wear", "dynamics", "one", "1", 1.0, nothing, **options))
-
-
-def test_a_task_that_is_unknown_is_refused():
     with pytest.raises(PluginError, match="task 'cost', expected one of return, loss"):
         check_spec(EnvironmentSpec("one", make_rescaled, Rescaled, (), (), 99, task="cost"))
 
@@ -428,27 +418,15 @@ def test_the_digest_does_not_depend_on_where_a_package_lies(package, monkeypatch
     assert code_digest("packed", []) == before
 
 
-def test_a_manifest_has_the_versions_of_what_simulates(cistern):
-    assert build("mine", "--strength", "offset=0.3") == 0
-    versions = load_split("mine").manifest["versions"]
-    assert set(versions) == {"oodd-eval", "numpy", "gymnasium", "click", "python"}
-    assert versions["click"] == version("click")
-
-
-def test_a_package_that_is_not_installed_is_named_before_anything_is_recorded(
+def test_a_package_that_is_not_installed_is_named_and_a_later_call_needs_none(
     cistern, monkeypatch, tmp_path, capsys
 ):
-    code = CISTERN.replace('packages=("click",)', 'packages=("no-such-simulator",)')
-    install(monkeypatch, tmp_path / "other", "cistern", code, header="")
-    assert build("mine", "--strength", "offset=0.3") == 4
-    assert "no-such-simulator is not installed" in capsys.readouterr().err
-
-
-def test_a_later_call_needs_no_package_of_an_earlier_one(cistern, monkeypatch, tmp_path):
     sizes = [*SIZES, "--cap", "80"]
     assert main(["data", "build", "two", *sizes, "--env", "cistern", "--strength", "iid=0.3"]) == 0
     code = CISTERN.replace('packages=("click",)', 'packages=("no-such-simulator",)')
     install(monkeypatch, tmp_path / "other", "cistern", code, header="")
+    assert build("mine", "--strength", "offset=0.3") == 4
+    assert "no-such-simulator is not installed" in capsys.readouterr().err
     assert main(["data", "build", "two", *sizes, "--env", "cartpole", "--strength", "iid=0.3"]) == 0
     split = load_split("two")
     assert split.environments == ("cartpole", "cistern")

@@ -1,8 +1,5 @@
 """Recorded episodes: redraws, caps, streams of numbers, and what reaches the terminal."""
 
-import subprocess
-import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -20,13 +17,9 @@ from oodd_eval.errors import SimulationError
 pytestmark = pytest.mark.slow
 
 
-def test_recording_prints_nothing_on_the_streams_of_its_process():
-    code = "from helpers_simulate import *; record('hopper', 'iid', 0, policy=Reflex('hopper'))"
-    child = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=False,
-        cwd=Path(__file__).parent,
-    )  # fmt: skip
-    assert (child.returncode, child.stdout, child.stderr) == (0, "", "")
+def test_recording_prints_nothing_on_the_streams_of_its_process(capfd):
+    record("hopper", "iid", 0, policy=Reflex("hopper"))
+    assert capfd.readouterr() == ("", "")
 
 
 def test_seeds_and_anomalies_have_streams_of_their_own():
@@ -53,7 +46,11 @@ def test_the_cap_ends_an_episode_without_terminating_it():
     assert (capped.trajectory.transitions, capped.terminated) == (40, False)
     longer = record_nominal("halfcheetah", 1, policy=Reflex("halfcheetah"), episode_cap=60)
     assert (longer.trajectory.observations[:41] == capped.trajectory.observations).all()
-    assert record_nominal("cartpole", 1, policy=_Right()).terminated
+    fallen = record_nominal("cartpole", 1, policy=_Right())
+    assert fallen.terminated
+    assert fallen.trajectory.transitions < 50
+    with pytest.raises(TwinTooShortError, match=r"cartpole with seed 1 .* at least 50"):
+        record("cartpole", "iid", 1, policy=_Right())
 
 
 class _Right:
@@ -63,35 +60,22 @@ class _Right:
         return 1
 
 
-def test_a_twin_of_under_50_transitions_gives_way():
-    with pytest.raises(TwinTooShortError, match=r"cartpole with seed 1 .* at least 50"):
-        record("cartpole", "iid", 1, policy=_Right())
-    assert record("cartpole", None, 1, policy=_Right()).trajectory.transitions < 50
-
-
-def test_draws_that_change_nothing_are_redrawn_and_counted(monkeypatch):
+def test_draws_that_change_nothing_are_redrawn_up_to_100_times(monkeypatch):
     true_draw, calls = recording.draw, []
 
-    def idle_twice(environment, anomaly, simulator, rng):
-        calls.append(anomaly)
-        drawn = true_draw(environment, anomaly, simulator, rng)
-        return drawn if len(calls) > 2 else Fault(drawn.parameters)
+    def idle(times):
+        def draw(environment, anomaly, simulator, rng):
+            calls.append(anomaly)
+            drawn = true_draw(environment, anomaly, simulator, rng)
+            return drawn if len(calls) > times else Fault(drawn.parameters)
 
-    monkeypatch.setattr(recording, "draw", idle_twice)
-    episode = record("cartpole", "drift", 1, policy=Reflex("cartpole"), episode_cap=60)
-    assert (episode.redraws, len(calls)) == (2, 3)
+        calls.clear()
+        monkeypatch.setattr(recording, "draw", draw)
+        return record("cartpole", "drift", 1, policy=Reflex("cartpole"), episode_cap=60)
 
-
-def test_draws_that_never_change_anything_are_an_error_after_100_redraws(monkeypatch):
-    calls = []
-
-    def idle(environment, anomaly, simulator, rng):
-        calls.append(anomaly)
-        return Fault({})
-
-    monkeypatch.setattr(recording, "draw", idle)
+    assert (idle(2).redraws, len(calls)) == (2, 3)
     with pytest.raises(SimulationError, match="no drift episode of cartpole with seed 1 differs"):
-        record("cartpole", "drift", 1, policy=Reflex("cartpole"), episode_cap=60)
+        idle(999)
     assert len(calls) == 101
 
 
@@ -122,13 +106,6 @@ def scripted(monkeypatch, script):
     return found, len(attempts)
 
 
-def test_a_tail_of_20_is_redrawn_and_one_of_21_is_kept(monkeypatch):
-    # Attempt k ends 18 + k transitions beyond its onset; T > onset + 20 holds first for k = 3.
-    found, attempts = scripted(monkeypatch, lambda k: (40 + k, 58 + 2 * k, 45 + k))
-    assert (found.trajectory.transitions - found.onset, found.redraws, attempts) == (21, 3, 4)
-    assert (found.onset, found.effect, found.parameters) == (43, 48, {"attempt": 3})
-
-
 def test_where_every_tail_is_short_the_longest_that_differs_from_its_twin_is_kept(monkeypatch):
     def script(k):
         # The longest of all, attempt 50, equals its twin; 20 and 70 tie behind it.
@@ -141,7 +118,11 @@ def test_where_every_tail_is_short_the_longest_that_differs_from_its_twin_is_kep
     assert found.trajectory.transitions == 50
 
 
-def test_an_episode_that_only_outlives_its_twin_equals_it(monkeypatch):
-    # Row 101 is the first that the twin does not have.
+def test_a_tail_of_20_is_redrawn_and_one_of_21_is_kept(monkeypatch):
+    # Attempt k ends 18 + k transitions beyond its onset; T > onset + 20 holds first for k = 3.
+    found, attempts = scripted(monkeypatch, lambda k: (40 + k, 58 + 2 * k, 45 + k))
+    assert (found.trajectory.transitions - found.onset, found.redraws, attempts) == (21, 3, 4)
+    assert (found.onset, found.effect, found.parameters) == (43, 48, {"attempt": 3})
+    # An episode that only outlives its twin equals it: row 101 is the first that it does not have.
     found, _ = scripted(monkeypatch, lambda k: (40, 150, 101 if k < 2 else 100))
     assert (found.redraws, found.effect) == (2, 100)
