@@ -38,6 +38,11 @@ def test_limits_are_what_sensors_do_in_nominal_episodes(stream):
     again = StreamLimits.of(limits.arrays())
     for name in ("mean", "std", "low", "high", "still", "repeated", "rest"):
         np.testing.assert_array_equal(getattr(again, name), getattr(limits, name))
+    # Before the first good reading it is the mean.
+    np.testing.assert_allclose(taken(stream, None)[0], limits.mean, rtol=1e-6)
+    single = Stream(StreamLimits.fit([Trajectory(np.arange(50.0)[:, None])]))
+    taken(single, [1.0], *[[np.nan]] * 5)
+    assert single.faults == {0: "missing"}
 
 
 def test_runs_are_counted_as_they_are_long():
@@ -67,22 +72,20 @@ def test_a_constant_sensor_may_have_any_reading_that_is_one():
         assert stream.faults == faults
 
 
-def test_before_the_first_good_reading_it_is_the_mean(stream):
-    (found,) = taken(stream, None)
-    np.testing.assert_allclose(found, stream.limits.mean, rtol=1e-6)
-
-
-def test_one_missing_reading_is_suspect_and_no_fault_and_soon_forgotten(stream):
-    taken(stream, row(0), row(1, 0))
-    assert stream.suspects == {0: 1}
-    assert stream.faults == {}
-    taken(stream, *map(row, range(2, 30)))
-    assert stream.suspects == {}
-
-
-def test_a_frozen_sensor_is_a_fault_and_a_contact_is_none(stream):
-    taken(stream, *[row(i, 0, value=0.5) for i in range(9)])
-    assert stream.faults == {0: "frozen"}
+@pytest.mark.parametrize(
+    ("rows", "faults", "suspects"),
+    [
+        ([row(i, 0, value=0.5) for i in range(9)], {0: "frozen"}, None),  # and no contact
+        ([row(0), row(1, 0)], {}, {0: 1}),
+        ([row(0), row(1, 0), *map(row, range(2, 30))], {}, {}),
+        ([row(0)] * 6, {"observation": "repeated"}, {}),
+        ([row(0), *[None] * 6], {"observation": "missing"}, {}),
+    ],
+)
+def test_faults_and_suspects_of_rows(stream, rows, faults, suspects):
+    taken(stream, *rows)
+    assert stream.faults == faults
+    assert suspects is None or stream.suspects == suspects
 
 
 def test_readings_beyond_those_of_training_are_a_fault_after_a_few(stream):
@@ -91,14 +94,6 @@ def test_readings_beyond_those_of_training_are_a_fault_after_a_few(stream):
     assert stream.faults == {0: "out of range"}
     # They are measurements, though, and the detector sees them.
     assert found[-1][0] == np.float32(far + 0.04)
-
-
-def test_what_all_sensors_do_is_a_fault_of_none(stream):
-    taken(stream, *[row(0)] * 6)
-    assert (stream.faults, stream.suspects) == ({"observation": "repeated"}, {})
-    stream.reset()
-    taken(stream, row(0), *[None] * 6)
-    assert (stream.faults, stream.suspects) == ({"observation": "missing"}, {})
 
 
 def test_an_action_that_does_not_come_is_the_last_one_and_a_fault(stream):
@@ -139,19 +134,10 @@ def test_actions_from_before_the_row_before_are_late():
         reading = watchdog.update(row(i), [0.0], 0.1 * i, 0.1 * i - 0.2)
     assert reading.faults == {"action": "late"}
     assert reading.alarm
-
-
-@pytest.mark.parametrize(("rate", "stamps"), [(None, {"time": 1.0}), (50, {"acted": 1.0})])
-def test_time_stamps_need_a_rate_and_those_of_actions_both(rate, stamps):
-    watchdog = Watchdog.fit("persistence", TRAIN, TRAIN, 0.1, rate=rate)
-    with pytest.raises(UsageError, match="time stamps need a watchdog fitted with rate="):
-        watchdog.update(row(0), **stamps)
-
-
-def test_a_single_sensor_is_its_own_fault():
-    stream = Stream(StreamLimits.fit([Trajectory(np.arange(50.0)[:, None])]))
-    taken(stream, [1.0], *[[np.nan]] * 5)
-    assert stream.faults == {0: "missing"}
+    for rate, stamps in ((None, {"time": 1.0}), (50, {"acted": 1.0})):
+        watchdog = Watchdog.fit("persistence", TRAIN, TRAIN, 0.1, rate=rate)
+        with pytest.raises(UsageError, match="time stamps need a watchdog fitted with rate="):
+            watchdog.update(row(0), **stamps)
 
 
 def test_readings_come_by_name_too():

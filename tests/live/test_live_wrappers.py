@@ -165,7 +165,13 @@ def test_a_crash_in_the_last_row_is_found_however_environments_start_anew(calm, 
         assert not any(r.alarm for r in going_on)
 
 
-def test_the_infos_of_a_step_in_which_an_episode_ends_keep_what_environments_say(calm):
+class Mute(gymnasium.vector.VectorWrapper):
+    def step(self, actions):
+        *step, info = self.env.step(actions)
+        return *step, {k: v for k, v in info.items() if "final" not in k}
+
+
+def test_the_infos_of_a_step_in_which_an_episode_ends_keep_what_environments_say(calm, fitted):
     envs = gymnasium.vector.SyncVectorEnv(
         [lambda: Falling(0), lambda: Falling(1)], autoreset_mode=AutoresetMode.SAME_STEP
     )
@@ -178,14 +184,7 @@ def test_the_infos_of_a_step_in_which_an_episode_ends_keep_what_environments_say
     assert info["_final_info"].tolist() == info["final_info"]["_oodd"].tolist() == [True, False]
     assert (info["final_info"]["oodd"][0].t, [r.t for r in info["oodd"]]) == (3, [0, 3])
     assert info["_oodd"].all()
-
-
-def test_environments_that_keep_the_last_observation_to_themselves_are_refused(calm):
-    class Mute(gymnasium.vector.VectorWrapper):
-        def step(self, actions):
-            *step, info = self.env.step(actions)
-            return *step, {k: v for k, v in info.items() if "final" not in k}
-
+    # Environments that keep the last observation to themselves, or how they start anew.
     envs = gymnasium.vector.SyncVectorEnv(
         [lambda: Falling(-2)] * 2, autoreset_mode=AutoresetMode.SAME_STEP
     )
@@ -193,9 +192,6 @@ def test_environments_that_keep_the_last_observation_to_themselves_are_refused(c
     env.reset(seed=3)
     with pytest.raises(UsageError, match=r"environment 0 .*final_obs.*: use AutoresetMode.NEXT_S"):
         env.step([5, 5])
-
-
-def test_environments_that_do_not_say_how_they_start_anew_are_refused(fitted):
     env = gymnasium.make_vec("CartPole-v1", 2, vectorization_mode="sync")
     env.metadata = {}
     with pytest.raises(UsageError, match="autoreset_mode=None"):
