@@ -1,4 +1,4 @@
-"""Forecasts of the torch ensembles in a slow, obvious loop: the oracle of tests and benchmarks."""
+"""Forecasts of the torch ensembles in a slow, obvious loop: the oracle of tests."""
 
 import numpy as np
 import torch
@@ -72,60 +72,3 @@ def change_of(made, network, stream, index, sensors):
             phi = torch.relu(dense(torch.cos(torch.pi * torch.arange(a.cosines) * tau), "cosine"))
         out.append(float((z * phi) @ p["out"][:, column] + p["out_bias"][0, column]))
     return out
-
-
-class Walker:
-    """The slow loop as it would run on a robot: memory carried along, one step at a time.
-
-    Every member and every sample is a pass of its own over single vectors, and the cosine embedding
-    is computed anew for each.
-    """
-
-    def __init__(self, made, *, horizon, samples, mean_sampling, seed):
-        if mean_sampling or made.architecture.per_feature or made.architecture.window > 1:
-            raise ValueError("the walker knows riqn with a shared trunk only")
-        self.made, self.horizon, self.samples, self.seed = made, horizon, samples, seed
-        self.weights = [{n: p[e] for n, p in made.named_parameters()} for e in range(made.members)]
-
-    def errors(self, rows, count):
-        """Return the first `count` errors of a trajectory of standardized observations."""
-        a, h = self.made.architecture, self.horizon
-        rows = torch.tensor(rows)
-        memories = [torch.zeros(a.units) for _ in self.weights]
-        found = []
-        for t in range(count):
-            drawn = quantile_levels(
-                self.seed, range(t + h, t + h + 1), h, len(self.weights), self.samples, a.features
-            )
-            total = 0.0
-            for e, p in enumerate(self.weights):
-                newest = rows[t]
-                f, memories[e] = gru_step(p, newest, memories[e])
-                for m in range(self.samples):
-                    o, g, memory = newest, f, memories[e]
-                    for k in range(h):
-                        if k:
-                            g, memory = gru_step(p, o, memory)
-                        linear = o @ self.made.base[:-1] + self.made.base[-1]
-                        o = linear + self.made.unit * change(p, g, memory, drawn[0, k, e, m])
-                    total += float((rows[t + h] - o).abs().mean())
-            found.append(total / len(self.weights) / self.samples)
-        return np.array(found)
-
-
-def gru_step(p, observation, memory):
-    h = len(memory)
-    f = torch.relu(observation @ p["first"] + p["first_bias"][0])
-    gates, recurrent = f @ p["gru_in"] + p["gru_in_bias"][0], memory @ p["gru"] + p["gru_bias"][0]
-    reset = torch.sigmoid(gates[:h] + recurrent[:h])
-    update = torch.sigmoid(gates[h : 2 * h] + recurrent[h : 2 * h])
-    candidate = torch.tanh(gates[2 * h :] + reset * recurrent[2 * h :])
-    return f, (1 - update) * candidate + update * memory
-
-
-def change(p, f, memory, index):
-    z = torch.relu(memory @ p["second"] + p["second_bias"][0]) + f
-    tau = (torch.from_numpy(index.astype(np.float32))[:, None] + 0.5) / GRID
-    cosines = torch.cos(torch.pi * torch.arange(len(p["cosine"])) * tau)
-    phi = torch.relu(cosines @ p["cosine"] + p["cosine_bias"][0])  # (D, H)
-    return ((z * phi) * p["out"].T).sum(1) + p["out_bias"][0]

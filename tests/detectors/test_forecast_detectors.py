@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from helpers_forecast import Walker, one_step, slow_errors
+from helpers_forecast import one_step, slow_errors
 from helpers_state import assert_zero_scales_are_refused
 from oodd_npn import npn
 from oodd_riqn import n_riqn, riqn, riqn_ms, riqn_r
@@ -181,16 +181,6 @@ def test_forecasts_are_the_same_whether_output_layers_are_kept(monkeypatch, arch
 
     assert np.array_equal(found(1000), found(0))
     assert np.array_equal(found(1000), found(9))
-
-
-@pytest.mark.parametrize("horizon", [1, 3])
-def test_the_loop_of_the_benchmark_computes_the_same(horizon):
-    made = network(2, features=2, random_head=True, units=8, cosines=5)
-    rows = waves(1, 12, 2)[0].observations
-    options = {"horizon": horizon, "samples": 3, "mean_sampling": False, "seed": 7}
-    expected = slow_errors(made, rows, **options)
-    found = Walker(made, **options).errors(rows, len(rows) - horizon)
-    assert np.allclose(found, expected, atol=1e-5)
 
 
 @pytest.fixture(scope="module", params=FACTORIES)
