@@ -118,13 +118,6 @@ class LookAheadFar(LookAhead):
         return future + 1e12
 
 
-class LookAheadThreshold(LookAhead):
-    """A billionth around a threshold of its own: above it where the future is unusual."""
-
-    def mixed(self, scores, future):
-        return 1.0 + 1e-9 * np.where(future > 1.1 * self.usual_, 1.0, -1.0)
-
-
 class LastBit(LookAhead):
     """The future in the last bit alone."""
 
@@ -132,32 +125,11 @@ class LastBit(LookAhead):
         return np.where(future > 1.1 * self.usual_, np.nextafter(1.0, 2.0), 1.0)
 
 
-class Stepped(LookAhead):
-    """The future behind a step so high that a thousandth of it hides everything."""
-
-    def mixed(self, scores, future):
-        return np.where(np.arange(len(scores)) < 0.3 * self.longest_, 0.0, 1e7 + 1e3 * future)
-
-
-class Standardized(LookAhead):
-    """Scores in units of the episode's own spread, which knows the whole episode."""
-
-    def mixed(self, scores, future):
-        return (scores - scores.mean()) / (scores.std() or 1.0) + 5000.0
-
-
 class Centred(LookAhead):
     """A mean over the 20 rows before and behind."""
 
     def mixed(self, scores, future):
         return np.convolve(scores, np.ones(41) / 41, mode="same")
-
-
-class Length(LookAhead):
-    """The shorter the episode is going to be, the higher."""
-
-    def mixed(self, scores, future):
-        return scores + self.most_ * (1.0 - len(scores) / self.longest_)
 
 
 # Company: who remembers an episode's twin knows when it leaves it.
@@ -611,12 +583,8 @@ KINDS = {
         "look-ahead": LookAhead,
         "look-ahead-prefix": LookAheadPrefix,
         "look-ahead-far": LookAheadFar,
-        "look-ahead-threshold": LookAheadThreshold,
         "last-bit": LastBit,
-        "stepped": Stepped,
-        "standardized": Standardized,
         "centred": Centred,
-        "length": Length,
         "short": ShortCalibration,
     },
     "company": {

@@ -2,6 +2,7 @@
 
 import pytest
 from helpers_fuzz import fuzz
+from helpers_robustness import Ground
 
 
 def pytest_collection_modifyitems(items):
@@ -9,6 +10,12 @@ def pytest_collection_modifyitems(items):
     for item in items:
         if "tests/attacks/" in item.nodeid:
             item.add_marker(pytest.mark.attacks)
+
+
+@pytest.fixture(scope="session")
+def ground(tmp_path_factory):
+    """Valid files of every kind, which tests copy."""
+    return Ground(tmp_path_factory.mktemp("ground"))
 
 
 @pytest.fixture

@@ -188,11 +188,18 @@ def test_whatever_stands_in_the_file_of_a_fit_is_a_fit_or_none(fuzzed):
         store.keep("key", pack({"weights": np.ones(3), "name": "x"}), 2.0)
         (file,) = Path(path).iterdir()
 
+        whole, kept = file.read_bytes(), store.find("key")
+        assert kept.seconds_fit == 2.0
+        one_bit = st.tuples(st.integers(0, len(whole) - 1), st.integers(0, 7)).map(
+            lambda at: whole[: at[0]] + bytes([whole[at[0]] ^ 1 << at[1]]) + whole[at[0] + 1 :]
+        )
+
         def tried(content):
             file.write_bytes(content)
-            kept = store.find("key")
-            assert kept is None or 0 <= kept.seconds_fit < np.inf
+            found = store.find("key")
+            if found is not None:
+                assert (found.packed.text, found.seconds_fit) == (kept.packed.text, 2.0)
+                assert np.array_equal(found.packed.arrays["weights"], np.ones(3))
 
-        whole = file.read_bytes()
-        assert store.find("key").seconds_fit == 2.0
-        fuzzed(damaged(st.just(whole)) | st.binary(max_size=50), tried)
+        cut_short = st.integers(0, len(whole) - 1).map(lambda size: whole[:size])
+        fuzzed(damaged(st.just(whole)) | one_bit | cut_short | st.binary(max_size=50), tried)

@@ -1,19 +1,16 @@
 """Commands killed at random moments: what was finished stays, and the end is what it would be.
 
-Moments follow from a seed, which is printed. With ``--long``, hundreds of kills instead of thirty.
+Moments follow from a seed. With ``--long``, hundreds of kills instead of thirty.
 """
 
 import json
-import os
 import random
-import signal
+import shutil
 import sys
-import time
 
 import pytest
-from helpers_plugins import install
-from helpers_processes import environment, oodd_eval, wait_until, workers_of
 from helpers_reproduce import install_quick
+from helpers_robustness import KILLED, left, program, run
 
 from oodd_eval.data.split import load_split
 from oodd_eval.results.directory import ResultsDirectory
@@ -22,132 +19,79 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="looks into /pro
 
 SEED = 20261123
 VOLATILE = {"seconds_fit", "seconds_score", "peak_rss_mb", "provenance"}
-SIMPLE = "@hookimpl\ndef oodd_detectors(): return offer(one=Good, two=Good)"
-
-
-class Killing:
-    """A command that is killed so many times, each at a random moment, and then resumed.
-
-    It runs once as a whole first, into ``whole``, which tells how long it takes on this machine.
-    """
-
-    def __init__(self, times, path, *arguments, **variables):
-        self.times, self.path, self.arguments = times, path, arguments
-        self.marker = f"RUN={path}"
-        self.variables = environment(path, path / "fits", RUN=str(path), **variables)
-        begun = time.monotonic()
-        self.finish(path / "whole")
-        self.seconds = time.monotonic() - begun
-
-    def start(self, output):
-        words = [str(output) if word is None else str(word) for word in self.arguments]
-        return oodd_eval(*words, env=self.variables, cwd=self.path, start_new_session=True)
-
-    def finish(self, output):
-        process = self.start(output)
-        said, _ = process.communicate(timeout=300)
-        assert process.returncode == 0, said
-        return said
-
-    def __call__(self, output, check):
-        """Kill and check, again and again; a command that ends by itself begins anew elsewhere."""
-        rng, killed, rounds = random.Random(SEED), 0, 0
-        while killed < self.times:
-            place = output.with_name(f"{output.name}-{rounds}")
-            kept = None
-            while killed < self.times:
-                process, moment = self.start(place), rng.uniform(0.2, self.seconds)
-                print(f"seed {SEED}, kill {killed} after {moment:.3f} s")  # noqa: T201
-                deadline = time.monotonic() + moment
-                while process.poll() is None and time.monotonic() < deadline:
-                    time.sleep(0.005)
-                ended = process.poll()
-                os.killpg(process.pid, signal.SIGKILL) if ended is None else None
-                said, _ = process.communicate()
-                assert "Traceback" not in said
-                assert wait_until(lambda: not workers_of(self.marker), seconds=20)
-                if ended is not None:
-                    assert ended == 0, said
-                    break
-                killed += 1
-                kept = check(place, kept)
-            else:
-                self.finish(place)
-            check(place, kept)
-            rounds += 1
-            yield place
-
-
-def times(request, by_default, long):
-    return long if request.config.getoption("--long") else by_default
+TIMES = {"run": 14, "reproduce": 3, "fetch": 5, "build": 5}
+"""How often a command is killed; others are killed once."""
 
 
 def records_of(output):
     plain = [json.loads(record.to_json()) for record in ResultsDirectory(output).records()]
-    return [{k: v for k, v in p.items() if k not in VOLATILE} for p in plain]
+    return sorted(str({k: v for k, v in p.items() if k not in VOLATILE}) for p in plain)
 
 
-def finished_stays(whole):
+def finished_stays(output, kept, whole):
     """Kept scores never change nor go, and records are at any moment some of the whole run's."""
-
-    def check(output, kept):
-        now = {f.name: f.read_bytes() for f in (output / "scores").glob("*.h5")}
-        for name, content in (kept or {}).items():
-            assert now.get(name) == content, f"{name} was lost or computed again"
-        if (output / "records.jsonl").exists():
-            assert all(record in whole for record in records_of(output))
-        return now
-
-    return check
+    now = {f.name: f.read_bytes() for f in (output / "scores").glob("*.h5")}
+    for name, content in (kept or {}).items():
+        assert now.get(name) == content, f"{name} was lost or computed again"
+    if (output / "records.jsonl").exists():
+        assert {*records_of(output)} <= {*records_of(whole)}
+    return now
 
 
-def test_a_run_killed_at_random(request, tiny_split, tmp_path, monkeypatch):
-    install(monkeypatch, tmp_path, "simple", SIMPLE)
-    killing = Killing(
-        times(request, 14, 250), tmp_path, "run", "-q", "--detector", "one,two", "--env", "all",
-        "--anomaly", "iid,gravity", "--split", tiny_split, "--jobs", "2", "--output", None,
-    )  # fmt: skip
-    whole = records_of(tmp_path / "whole")
-    assert len(whole) == 8
-    for place in killing(tmp_path / "killed", finished_stays(whole)):
-        assert records_of(place) == whole
+def whole_or_absent(output, _kept, whole):
+    """A split has its manifest last: it is the whole one, or is not there."""
+    if (output / "manifest.json").exists():
+        split = load_split(output)
+        assert split.digest == load_split(whole).digest
+        assert all(found.ok for found in split.verify())
 
 
-def test_a_reproduction_killed_at_random(request, tiny_split, tmp_path, monkeypatch):
-    install_quick(monkeypatch, tmp_path)
-    killing = Killing(
-        times(request, 3, 100), tmp_path, "reproduce", "-q", "--tier", "mini", "--split",
-        tiny_split, "--only", "delays", "--jobs", "2", "--no-figures", "--output", None,
-    )  # fmt: skip
-    whole = records_of(tmp_path / "whole")
-    for place in killing(tmp_path / "killed", finished_stays(whole)):
-        # What was left comes behind what was there.
-        assert sorted(map(str, records_of(place))) == sorted(map(str, whole))
-        assert (place / "README.md").read_bytes() == (tmp_path / "whole/README.md").read_bytes()
+CHECKS = {"run": finished_stays, "reproduce": finished_stays, "fetch": whole_or_absent,
+          "build": whole_or_absent}  # fmt: skip
 
 
-SPLITS = {
-    "fetch": ("fetch", "SPLIT"),
-    "build": ("build", "small", "--train", "4", "--calibration", "2", "--test", "2", "--cap", "60",
-              "--seed-base", "850", "--env", "cartpole", "--jobs", "1"),
-}  # fmt: skip
+def names_below(home):
+    """Files below a directory, but for logs of the run and what is kept to go on."""
+    files = (p for p in home.rglob("*") if p.is_file() and "logs" not in p.parts[-3:])
+    return {str(p.relative_to(home)) for p in files}
 
 
-@pytest.mark.parametrize("command", SPLITS)
-def test_a_split_whose_command_was_killed_is_whole_or_absent(
-    request, tiny_split, tmp_path, command
+@pytest.mark.parametrize("command", KILLED)
+def test_a_command_killed_at_random_ends_as_if_it_never_had_been(
+    request, ground, tiny_split, tmp_path, monkeypatch, command
 ):
-    """It has its manifest last."""
-    pytest.importorskip("gymnasium")
-    words = [tiny_split if word == "SPLIT" else word for word in SPLITS[command]]
-    killing = Killing(times(request, 6, 75), tmp_path, "data", *words, "--output", None)
-    digest = load_split(tmp_path / "whole").digest
-
-    def whole_or_absent(output, _kept):
-        if (output / "manifest.json").exists():
-            split = load_split(output)
-            assert split.digest == digest
-            assert all(found.ok for found in split.verify())
-
-    for place in killing(tmp_path / "killed", whole_or_absent):
-        assert load_split(place).digest == digest
+    if "--sandbox" in KILLED[command] and not shutil.which("bwrap"):
+        pytest.skip("needs bubblewrap")
+    if command == "reproduce":
+        install_quick(monkeypatch, tmp_path / "plugins")
+    words = [str(tiny_split) if word == "TINY" else word for word in KILLED[command]]
+    settings = {"start": program(command), "plugins": [tmp_path / "plugins"], "limit": 300}
+    check = CHECKS.get(command, lambda *_: None)
+    whole = ground.copy(tmp_path / "whole")
+    once = run(whole, *words, **settings)
+    assert not [*once.problems], once.output
+    rng, times = random.Random(SEED), TIMES.get(command, 1)
+    place, kept, rounds = ground.copy(tmp_path / "killed"), None, 0
+    for _ in range(30 * times if request.config.getoption("--long") else times):
+        moment = rng.uniform(min(0.2, 0.1 * once.seconds), once.seconds)
+        ended = run(place, *words, kill_after=moment, **settings)
+        assert "Traceback" not in ended.output
+        assert not [problem for problem in left(place) if problem.startswith("process")]
+        kept = check(place / "out", kept, whole / "out")
+        if ended.code is not None:  # it has ended by itself, and begins anew elsewhere
+            assert ended.code == once.code, ended.output
+            rounds += 1
+            place, kept = ground.copy(tmp_path / f"killed-{rounds}"), None
+    again = run(place, *words, **settings)
+    # What was finished is there, and is not written once more.
+    refused = command in {"export", "submit"} and again.code == 4 and "exists" in again.output
+    assert again.code == once.code or refused, again.output
+    assert not [*again.problems, *left(place)], again.output
+    check(place / "out", kept, whole / "out")
+    if not refused:
+        assert names_below(place) == names_below(whole)
+    if check is finished_stays:
+        assert records_of(place / "out") == records_of(whole / "out")
+    if command == "reproduce":
+        pages = ((home / "out/README.md").read_bytes() for home in (place, whole))
+        assert next(pages) == next(pages)

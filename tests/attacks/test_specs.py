@@ -78,13 +78,6 @@ class Text(str):
 class Mute(Exception):
     def __str__(self): raise SystemExit("mute")
 
-class Meta(type):
-    __name__ = property(lambda self: sys.exit("name"))
-    def __getattribute__(self, name): sys.exit(name)
-
-class MetaError(Exception, metaclass=Meta):
-    pass
-
 class Endless(list):
     def __iter__(self):
         while True: yield DetectorSpec("odd", Good, "")
@@ -95,9 +88,6 @@ class Spec(DetectorSpec):
 def endless():
     while True: yield DetectorSpec("odd", Good, "")
 
-class Odd(metaclass=Meta):
-    pass
-
 Shown = type("Shown", (), {"__repr__": lambda self: sys.exit("shown")})
 
 @hookimpl
@@ -106,18 +96,12 @@ def first(): @RETURNS@
 """
 RETURNED = {
     "text": "return [DetectorSpec(Text('odd'), Good, '')]",
-    "summary": "return [DetectorSpec('odd', Good, Text('odd'))]",
-    "inputs": "return [DetectorSpec('odd', Good, '', inputs=Text('observations'))]",
-    "requires": "return [DetectorSpec('odd', Good, '', requires=(Text('json'),))]",
     "subclass": "return [Spec('odd', Good, '')]",
     "no-spec": "return [Shown()]",
     "mute": "raise Mute",
-    "metaclass": "raise MetaError",
     "exit": "sys.exit(Shown())",
     "cancelled": "raise GeneratorExit",
-    "parameters": "return [DetectorSpec('odd', Good, '', parameters=Odd)]",
     "default": "return [DetectorSpec('odd', Good, '', parameters=declared_by({'a': Shown()}))]",
-    "text-default": "return [DetectorSpec('odd', Good, '', parameters=declared_by({'a': Text()}))]",
     "many-parameters": "return [DetectorSpec('odd', Good, '', parameters=declared_by("
     "dict.fromkeys(map('a{}'.format, range(999)))))]",
     "many": "return [DetectorSpec(f'odd-{i}', Good, '') for i in range(5000)]",

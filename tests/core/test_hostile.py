@@ -96,6 +96,18 @@ QUICK = {
                  "error", "the worker was killed by signal 40 while scoring"),
     "scored": ("def score(self, x): os._exit(93)",
                "error", "the worker closed its pipe while scoring, without a result"),
+    "factoryexits": ("def __init__(self, **_): sys.exit(0)", "error", r"called sys.exit\(0\)"),
+    "atexit": ("""
+        def fit(self, nominal): import atexit; atexit.register(time.sleep, 600)""",
+               "ok", ""),
+    "leaves": ("""
+        def fit(self, nominal):
+            subprocess.Popen(["sleep", "600"], start_new_session=True)""",
+               "incompatible", "processes run on after fit"),
+    "threads": ("""
+        def fit(self, nominal):
+            for _ in range(50): threading.Thread(target=time.sleep, args=(600,)).start()""",
+                "incompatible", "threads or processes run on after fit"),
 }  # fmt: skip
 
 UNMARKED = f"600.{os.getpid()}"

@@ -177,43 +177,14 @@ def test_a_newer_python_says_why_it_records_no_robot(newer, tmp_path):
 
 RUN = "oodd_eval run --env cartpole --anomaly iid,gravity --limit 5 --output results --detector"
 
-PROGRAMS = {
-    # One episode in each format of the extra that a few lines can write; the other readers load.
-    "write_logs": """
-import numpy, pyarrow, pyarrow.parquet
-import mcap_ros2.decoder, mcap.reader, pyulog, rosbags.highlevel, scipy.io
-speed = numpy.random.default_rng(0).normal(size=300)
-for i in range(6):
-    pyarrow.parquet.write_table(pyarrow.table({"t": numpy.arange(300) / 10, "speed": speed + i}),
-                                f"logs/{i}.parquet")
-""",
-    "write_csv": """
-import random
-random.seed(0)  # of unseeded ones, one scan in ten finds something odd
-for i in range(30):
-    rows = (f"{t / 10},{random.gauss(0, 1)}" for t in range(100))
-    open(f"logs/{i}.csv", "w").write("\\n".join(["t,speed", *rows]))
-""",
-    "cluster": """
-import subprocess, sys
-from distributed import LocalCluster
-if __name__ == "__main__":
-    options = dict(n_workers=1, threads_per_worker=1, dashboard_address=None)
-    with LocalCluster(**options) as cluster:
-        executor = cluster.scheduler_address.replace("tcp", "dask")
-        sys.exit(subprocess.run([sys.executable, "-m", *sys.argv[1:], executor]).returncode)
-""",
-    "draw": """
-from oodd_eval import load_results
-load_results("results").plot_trajectory("cartpole", "iid", row="persistence").savefig("plot.png")
-""",
-    "make_actor": re.search(
-        r"```python\n(import numpy as np\nimport onnx\n.*?)```",
-        (ROOT / "docs" / "how-to" / "policies.md").read_text(),
-        re.DOTALL,
-    )[1],
-}
-"""Modules beside the commands below."""
+IMPORTS = """
+import importlib, sys
+from importlib.metadata import packages_distributions
+for module, names in packages_distributions().items():
+    if {*sys.argv[1:]} & {*names} and not module.startswith("_"):
+        importlib.import_module(module)
+"""
+"""A module that imports what some distributions have brought."""
 
 USES = {
     "": [f"{RUN} mewma,persistence"],
@@ -225,30 +196,10 @@ USES = {
     "sim": [f"{RECORD} acrobot,lunarlander"],
     "worlds": [f"{RECORD} arm,drone,tank"],
     "train": ["oodd_eval policies train cartpole --steps 1500 --output policy"],
-    "onnx": [
-        "make_actor",
-        "oodd_eval policies import actor.onnx --env cartpole --output actor.npz",
-    ],
-    "mujoco": [f"{RECORD} swimmer"],
-    "dask": [f"cluster {RUN} mewma --executor"],
-    "logs": ["write_logs", "oodd_eval data inspect logs"],
-    "viewers": ["write_csv", "oodd_eval scan logs --rerun scan.rrd --mcap scan.mcap"],
     "check": ["oodd_eval check persistence"],
-    "plots": [f"{RUN} persistence", "draw"],
-    "docs": [f"mkdocs build --quiet --strict --config-file {ROOT}/mkdocs.yml --site-dir site"],
-    "test": [
-        f"pytest -n 0 -p no:cacheprovider --rootdir {ROOT} {ROOT}/tests/recording/test_worlds.py"
-    ],
-    "dev": [
-        f"mypy --cache-dir mypy --follow-imports skip {ROOT}/oodd_eval/errors.py",
-        "build --version",
-    ],
     "all": [f"{RUN} rf,pyod:ECOD", f"{RECORD} lunarlander,drone", "oodd_eval check mewma"],
 }
-"""Modules that show an extra at work, with their arguments."""
-
-WITH = {"onnx": "onnx,gym"}
-"""What an extra is installed with where it is of no use alone."""
+"""Commands that show an extra at work; of the others, what they install is imported."""
 
 
 def pytest_generate_tests(metafunc):
@@ -265,7 +216,7 @@ def scratch(tmp_path):
     shutil.rmtree(tmp_path)
 
 
-def test_every_extra_works_as_the_table_says(version, extra, wheel, scratch):
+def test_every_extra_works_as_the_table_says(version, extra, metadata, wheel, scratch):
     base = interpreter(version)
     if base is None:
         pytest.skip(f"no Python {version} on this machine")
@@ -273,16 +224,10 @@ def test_every_extra_works_as_the_table_says(version, extra, wheel, scratch):
         _, errors = environment(base, scratch / "venv", "pybullet", options=())
         assert "No matching distribution found for pybullet" in errors
         return
-    extras = WITH.get(extra, extra)
-    python, errors = environment(base, scratch / "venv", f"{wheel}[{extras}]" if extra else wheel)
+    python, errors = environment(base, scratch / "venv", f"{wheel}[{extra}]" if extra else wheel)
     assert not errors
-    for name, program in PROGRAMS.items():
-        (scratch / f"{name}.py").write_text(program)
-    (scratch / "logs").mkdir()
-    if extra == "mujoco":
-        library = scratch / "venv" / "lib" / f"python{version}" / "site-packages"
-        swimmer = ROOT / "examples" / "oodd-swimmer"
-        install = [*PIP, "install", "--no-deps", "--no-build-isolation", "--target", library]
-        subprocess.run([*install, swimmer], check=True)
-    for arguments in USES[extra]:
+    (scratch / "imports.py").write_text(IMPORTS)
+    brought = required(metadata, extra, version) - required(metadata, "", version)
+    uses = USES.get(extra, [f"imports {' '.join(brought)}"])
+    for arguments in uses:
         execute(python, scratch, arguments, warnings="default")  # of libraries, there are some
