@@ -31,6 +31,7 @@ sys.path[:] = [str(TESTS), *(path for path in sys.path if path != HERE)]  # it h
 
 import adversaries  # noqa: E402
 from helpers_plugins import install_adversaries  # noqa: E402
+from oodd_leaderboard.sandbox.launcher import Sandbox  # noqa: E402
 from oodd_leaderboard.verify.rerun import differences  # noqa: E402
 from oodd_recording.build import build_split, digest_of_bits  # noqa: E402
 
@@ -94,8 +95,8 @@ def play(
         discover(), split=split, detectors=names, anomalies=anomalies, parameters=parameters,
         environments=environments or [*split.environments],
     )  # fmt: skip
-    hidden = (*split_places(split), str(output)) if rerun else None
-    settings = RunSettings(limits=Limits(seconds, MEMORY, hidden), streamed=rerun)
+    launcher = Sandbox((*split_places(split), str(output))) if rerun else None
+    settings = RunSettings(limits=Limits(seconds, MEMORY), launcher=launcher, streamed=rerun)
     run(plan, split, discover(), settings, ResultsDirectory(output))
 
 

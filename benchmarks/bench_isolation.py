@@ -14,6 +14,8 @@ import tempfile
 import time
 from unittest.mock import patch
 
+from oodd_leaderboard.sandbox.launcher import Sandbox
+
 from oodd_eval import evaluate, load_split
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.plugins.isolation.child import Limits
@@ -68,7 +70,7 @@ def rows_in_sandboxes(jobs):
         results = ResultsDirectory(path)
         for settings in (
             RunSettings(jobs=jobs),
-            RunSettings(jobs=jobs, streamed=True, limits=Limits(3600, hidden=())),
+            RunSettings(jobs=jobs, streamed=True, limits=Limits(3600), launcher=Sandbox(())),
         ):
             start = time.perf_counter()
             records = run(plan, split, plugins, settings, results).records

@@ -2,8 +2,9 @@
 
 import json
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import click
 from rich.console import Console
@@ -23,6 +24,7 @@ from oodd_eval.cli import (
     detector_options,
     expression_option,
     fit_options,
+    load,
     row_metrics_option,
     say,
     say_notes,
@@ -39,16 +41,21 @@ from oodd_eval.metrics.promise import PromiseFinding
 from oodd_eval.names import counted, expression
 from oodd_eval.plugins import hookimpl
 from oodd_eval.plugins.isolation.child import Limits
-from oodd_eval.plugins.isolation.sandbox import require_sandbox
 from oodd_eval.prose import print_prose
 from oodd_eval.results.directory import REPORT, ResultsDirectory
 from oodd_eval.results.render import FORMATS
 from oodd_eval.results.report import Report
 from oodd_eval.scoring.doubts import doubts_after, doubts_before
-from oodd_eval.scoring.executors import LOCAL, RunSettings
+from oodd_eval.scoring.executors import RunSettings
 from oodd_eval.scoring.plan import Plan, make_plan
 from oodd_eval.scoring.runner import RunOutcome
 from oodd_eval.scoring.runner import run as run_plan
+
+SANDBOX: Final = "oodd_leaderboard.sandbox.launcher:make_sandbox"
+"""Makes the launcher of ``--sandbox``, given paths that workers must not see."""
+
+DESCRIBED: Final = "oodd_leaderboard.sandbox.describe:discover_in_sandbox"
+"""Finds plug-ins as `discover` does, without importing any."""
 
 
 class _Configurable(Command):
@@ -98,14 +105,15 @@ def run(options: Options) -> int:
     The exit code is 1 when a cell failed, and 2 when the run was interrupted. What was done before
     is kept: the same command goes on.
     """
-    split, hidden = load_split(options.split), None
+    split, launcher = load_split(options.split), None
     if options.sandbox:
-        if options.executor != LOCAL:
-            raise UsageError("--sandbox is for workers of this machine, without --executor")
-        require_sandbox()
-        hidden = (*split_places(split), str(options.output))
-    limits = Limits(options.timeout, options.memory, hidden)
-    plugins = discovered(options, limits)
+        launcher = load(SANDBOX)([*split_places(split), str(options.output)])
+        find = partial(load(DESCRIBED), launcher=launcher, memory=options.memory)
+        plugins = discovered(options, find)
+        if watching := ", ".join(point.name for point in plugins.observer_points):
+            say(f"plug-ins that observe runs are left out of a sandboxed one: {watching}")
+    else:
+        plugins = discovered(options)
     environments, anomalies = split.select(options.env, options.anomaly)
     if options.row_metrics and not any(_lacks_twins(split, name) for name in environments):
         raise UsageError(f"--row-metrics is for splits without twins, unlike split {split.name}")
@@ -136,7 +144,8 @@ def run(options: Options) -> int:
         return 0
     settings = RunSettings(
         jobs=options.jobs,
-        limits=limits,
+        limits=Limits(options.timeout, options.memory),
+        launcher=launcher,
         fresh=options.fresh,
         stop_on_failure=options.stop,
         executor=options.executor,

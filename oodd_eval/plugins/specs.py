@@ -1,7 +1,7 @@
 """Specs of detectors as plain data: exact types, bounded, checked, and of nobody's classes.
 
 A plug-in's spec may be of a class of its own, and so may each text in it. What the harness keeps is
-a copy; in a sandbox the copy comes over a pipe, and nothing else of the plug-in does.
+a copy.
 """
 
 import functools
@@ -9,13 +9,13 @@ import math
 import operator
 import re
 import types
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, is_dataclass, make_dataclass
+from collections.abc import Callable, Mapping, Sequence, Sized
+from dataclasses import fields, is_dataclass, make_dataclass, replace
 from typing import Any, Final, get_args
 
 from oodd_eval.errors import PluginError
 from oodd_eval.names import PARAMETER_NAME, SPEC_NAME
-from oodd_eval.plugins.contract import Alarm, Detector, DetectorSpec, Training
+from oodd_eval.plugins.contract import Alarm, DetectorSpec, Training
 from oodd_eval.plugins.parameters import Decides, ParameterInfo, parameter, parameters_of
 
 MOST_SPECS: Final = 1000  # that one hook may return
@@ -25,105 +25,70 @@ _DEEPEST: Final = 8  # lists within lists of a default
 _LONGEST_LINE: Final = 1000  # characters
 _LONGEST_TEXT: Final = 10_000  # characters of a default
 
-Description = dict[str, Any]
-"""A spec as values that JSON knows, without its factory."""
-
-_TYPES: Final[dict[str, type]] = {
-    t.__name__: t for t in (bool, int, float, str, list, tuple, dict, types.NoneType, object)
-}
+PLAIN_TYPES: Final = (bool, int, float, str, list, tuple, dict, types.NoneType, object)
+"""Types of the values of parameters."""
 
 
 def plain_spec(spec: object) -> DetectorSpec:
     """Return a copy of a plug-in's spec in plain types; raise `PluginError` for what is none."""
     if type(spec) is not DetectorSpec:
         raise PluginError(f"{spec!r:.80} is offered, expected a oodd_eval.DetectorSpec")
-    return spec_of(description_of(spec), spec.factory)
-
-
-def description_of(spec: DetectorSpec) -> Description:
-    """Return a spec as plain values; raise `PluginError` where a field is none."""
     check_detector_spec(spec)
-    values = {name: getattr(spec, name) for names, *_ in _FIELDS for name in names.split()}
-    del values["factory"]
-    values["requires"] = [*spec.requires]
+    declared = None
     if spec.parameters is not None:
-        declared = parameters_of(spec.parameters)
-        if len(declared) > _MOST_PARAMETERS:
-            raise PluginError(f"{len(declared)} parameters, expected at most {_MOST_PARAMETERS}")
-        values["parameters"] = {name: _description_of(name, p) for name, p in declared.items()}
-    return values
+        declared = declared_as(parameters_of(spec.parameters))
+    return replace(spec, requires=tuple(spec.requires), parameters=declared)
 
 
-def spec_of(description: Mapping[str, Any], factory: Callable[..., Detector]) -> DetectorSpec:
-    """Return the spec that `description_of` described, perhaps elsewhere, checked again.
+def declared_as(infos: Mapping[str, ParameterInfo]) -> type:
+    """Return a dataclass that declares these parameters, in plain types, as `parameters_of` reads.
 
-    Raises `PluginError`, or what Python raises for values of another form.
+    Raises `PluginError` where one is none.
     """
-    values = {**description, "requires": tuple(description["requires"])}
-    if (declared := description["parameters"]) is not None:
-        if len(declared) > _MOST_PARAMETERS:
-            raise PluginError(f"{len(declared)} parameters, expected at most {_MOST_PARAMETERS}")
-        columns = [_field(name, facts) for name, facts in declared.items()]
-        values["parameters"] = make_dataclass("Parameters", columns, frozen=True)
-    spec = DetectorSpec(factory=factory, **values)
-    check_detector_spec(spec)
-    return spec
+    check_count(infos)
+    columns = [_field(name, info) for name, info in infos.items()]
+    return make_dataclass("Parameters", columns, frozen=True)
+
+
+def check_count(parameters: Sized) -> None:
+    """Raise `PluginError` for more parameters than a detector can have."""
+    if len(parameters) > _MOST_PARAMETERS:
+        raise PluginError(f"{len(parameters)} parameters, expected at most {_MOST_PARAMETERS}")
 
 
 def check_detector_spec(spec: DetectorSpec) -> None:
     """Raise `PluginError` for the first field of a spec whose type or alphabet is wrong."""
-    for names, expected, fits in _FIELDS:
+    for names, expected, fits in FIELDS:
         for name in names.split():
             if not fits(value := getattr(spec, name)):
                 raise PluginError(f"{name} of a DetectorSpec is {value!r:.80}, expected {expected}")
 
 
-def _description_of(name: str, info: ParameterInfo) -> Description:
-    """Return a parameter as plain values."""
-    return {
-        "types": _type_names(info.types),
-        "items": _type_names(info.items),
-        "default": _plain(name, info.default),
-        "low": info.low,
-        "above": info.above,
-        "high": info.high,
-        "choices": _plain(name, info.choices),
-        "decides": info.decides,
-        "help": info.help,
-    }
-
-
-def _field(name: str, facts: Mapping[str, Any]) -> tuple[str, Any, Any]:
+def _field(name: str, info: ParameterInfo) -> tuple[str, Any, Any]:
     """Return a field of a dataclass of parameters, which `parameters_of` reads."""
-    default = _plain(name, facts["default"])
-    bounds = {bound: facts[bound] for bound in ("low", "above", "high")}
-    lists = facts["items"], facts["choices"]
+    bounds = {bound: getattr(info, bound) for bound in ("low", "above", "high")}
+    default, choices = _plain(name, info.default), _plain(name, info.choices)
     for fits, expected in (
         (_text(PARAMETER_NAME)(name) and not name.startswith("__"), "an ASCII name"),
         (all(map(_is_bound, bounds.values())), "finite numbers, or None, as bounds"),
-        (all(type(values) is list and len(values) <= _MOST_CHOICES for values in lists), "lists"),
-        (_one_of(*get_args(Decides))(facts["decides"]), f"one of {get_args(Decides)} as decides"),
-        (is_line(facts["help"]), "a printable line as help"),
+        (max(len(info.items), len(choices)) <= _MOST_CHOICES, f"at most {_MOST_CHOICES} choices"),
+        (_one_of(*get_args(Decides))(info.decides), f"one of {get_args(Decides)} as decides"),
+        (is_line(info.help), "a printable line as help"),
     ):
         if not fits:
-            raise PluginError(f"parameter {name!r:.80} is {facts!r:.200}, expected {expected}")
-    hint = _annotation(facts["types"])
-    if facts["types"] == ["list"] and facts["items"]:
-        hint = types.GenericAlias(list, (_annotation(facts["items"]),))
-    choices = tuple(_plain(name, choice) for choice in facts["choices"])
-    more = {"decides": facts["decides"], "help": facts["help"], "choices": choices}
-    return name, hint, parameter(default, **bounds, **more)
+            raise PluginError(f"parameter {name!r:.80} is {info!r:.200}, expected {expected}")
+    hint = _annotation(info.types)
+    if info.types == (list,) and info.items:
+        hint = types.GenericAlias(list, (_annotation(info.items),))
+    declared = parameter(
+        default, **bounds, choices=tuple(choices), decides=info.decides, help=info.help
+    )
+    return name, hint, declared
 
 
-def _annotation(names: Sequence[str]) -> Any:
-    """Return the annotation of a field whose values are of one of some types."""
-    return functools.reduce(operator.or_, [_TYPES[name] for name in names])
-
-
-def _type_names(kinds: tuple[type, ...]) -> list[str]:
-    """Return the names of plain types; any other type allows every value."""
-    known = {kind: name for name, kind in _TYPES.items()}
-    return [known.get(kind, "object") for kind in kinds]
+def _annotation(kinds: Sequence[type]) -> Any:
+    """Return the annotation of a field of some types; one that is not plain allows every value."""
+    return functools.reduce(operator.or_, [t if t in PLAIN_TYPES else object for t in kinds])
 
 
 def _plain(name: str, value: Any, depth: int = 0) -> Any:
@@ -177,7 +142,7 @@ def _declares(parameters: Any) -> bool:
 
 
 _INPUTS: Final = ("observations", "observations+actions")
-_FIELDS: Final[tuple[tuple[str, str, Callable[[Any], bool]], ...]] = (
+FIELDS: Final[tuple[tuple[str, str, Callable[[Any], bool]], ...]] = (
     (
         "name",
         "lower-case letters, digits, '-', at most 64, perhaps ':' and a name",

@@ -79,6 +79,7 @@ def run(
                 data(unit.environment),
                 plugins.offer(unit.setting.detector),
                 settings.streamed,
+                settings.launcher,
             )
             for unit in map(plan.units.__getitem__, order)
         ]

@@ -26,7 +26,7 @@ from oodd_eval.plugins import contract, explanations
 from oodd_eval.plugins.contract import Progress, ignore_progress
 from oodd_eval.plugins.discovery import Offer, describe, printable
 from oodd_eval.plugins.explanations import Named
-from oodd_eval.plugins.isolation.child import Limits, Stop
+from oodd_eval.plugins.isolation.child import Launcher, Limits, Stop
 from oodd_eval.plugins.isolation.supervisor import Outcome, run_isolated
 from oodd_eval.plugins.state import PackedState
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
@@ -68,13 +68,17 @@ class Member(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class UnitJob:
-    """The work of one unit, to be called in a thread of its own; row by row where `streamed`."""
+    """The work of one unit, to be called in a thread of its own.
+
+    Rows are scored one by one where `streamed`. Workers are started by the `launcher`, if any.
+    """
 
     plan: Plan
     unit: Unit
     data: EnvironmentData
     offer: Offer
     streamed: bool = False
+    launcher: Launcher | None = None
 
     def __call__(
         self,
@@ -185,6 +189,7 @@ class GroupedScoring:
             again,
             limits=limits,
             stop=stop,
+            launcher=self._job.launcher,
             state=state,
             keep=keep,
             streamed=self._job.streamed,

@@ -8,10 +8,13 @@ import secrets
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
 import click
 from oodd_leaderboard.commands.entries import report, write_grant
+from oodd_leaderboard.sandbox.describe import discover_in_sandbox
+from oodd_leaderboard.sandbox.launcher import make_sandbox
 from oodd_leaderboard.verify import EntryVerdict, verify
 from oodd_leaderboard.verify.rerun import (
     ORDER,
@@ -45,7 +48,6 @@ from oodd_eval.metrics.catalogue import UNDEFINED, metric_info
 from oodd_eval.names import select
 from oodd_eval.plugins.discovery import Plugins
 from oodd_eval.plugins.isolation.child import Limits
-from oodd_eval.plugins.isolation.sandbox import require_sandbox
 from oodd_eval.results.board import grouped, ranked_by
 from oodd_eval.results.directory import RECORDS, ResultsDirectory
 from oodd_eval.results.record import Record
@@ -101,9 +103,9 @@ def rerun(options: Options) -> int:
     records = chosen(verdicts, options, read_order(results.path))
     environments = in_order((record.environment for record in records), ENVIRONMENTS)
     if missing := unfinished(records, results):
-        require_sandbox()
-        limits = Limits(options.timeout, options.memory, (str(results.path.absolute()),))
-        plugins = discovered(options, limits)
+        launcher = make_sandbox([results.path.absolute()])
+        find = partial(discover_in_sandbox, launcher=launcher, memory=options.memory)
+        plugins = discovered(options, find)
         check_installed(missing, plugins)
     order = draw(verdicts, results.path, environments)
     if missing:
@@ -257,10 +259,10 @@ def _run(
     bits, directory = int(order.bits, 16), results.path / SPLIT_DIRECTORY
     record_split(definition, options, order.environments, directory, bits=bits)
     split = load_split(directory)
-    hidden = (*split_places(split), str(results.path.absolute()))
     settings = RunSettings(
         jobs=options.jobs,
-        limits=Limits(options.timeout, options.memory, hidden),
+        limits=Limits(options.timeout, options.memory),
+        launcher=make_sandbox((*split_places(split), results.path.absolute())),
         command=options.invocation,
         streamed=True,
     )

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from helpers_plugins import install_adversaries
 from helpers_split import make_split
+from oodd_leaderboard.sandbox.launcher import Sandbox
 
 from oodd_eval.data.split import load_split, split_places
 from oodd_eval.plugins.discovery import discover
@@ -35,8 +36,8 @@ def play(names, directory, output, *, boxed):
         discover(), split=split, detectors=names, environments=[ENVIRONMENT],
         anomalies=["iid", "gravity"],
     )  # fmt: skip
-    hidden = (*split_places(split), str(output)) if boxed else None
-    settings = RunSettings(limits=Limits(300, 2 * 10**9, hidden), streamed=boxed)
+    launcher = Sandbox((*split_places(split), str(output))) if boxed else None
+    settings = RunSettings(limits=Limits(300, 2 * 10**9), launcher=launcher, streamed=boxed)
     records = run(plan, split, discover(), settings, ResultsDirectory(output)).records
     return {name: [r for r in records if r.detector == name] for name in names}
 

@@ -8,18 +8,18 @@ import time
 
 import pytest
 from helpers_plugins import install
+from oodd_leaderboard.sandbox import describe
+from oodd_leaderboard.sandbox.describe import discover_in_sandbox
+from oodd_leaderboard.sandbox.launcher import Sandbox
 
 from oodd_eval.data.split import load_split
 from oodd_eval.errors import UnknownNameError, UsageError
 from oodd_eval.plugins.discovery import discover
-from oodd_eval.plugins.isolation import describe
-from oodd_eval.plugins.isolation.child import Limits
-from oodd_eval.plugins.isolation.describe import discover_in_sandbox
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.scoring.plan import make_plan, source_digest
 
 pytestmark = pytest.mark.skipif(not shutil.which("bwrap"), reason="needs bubblewrap")
-LIMITS = Limits(60, 10**9, ())
+MEMORY = 10**9
 
 HOOK = "\n@hookimpl\ndef oodd_detectors(): return offer(odd=Good)\n"
 ANSWERS = """
@@ -73,7 +73,7 @@ def test_what_a_plug_in_does_at_import_breaks_it_alone(code, reason, monkeypatch
     monkeypatch.setattr(describe, "SECONDS", 12)
     install(monkeypatch, tmp_path, "odd", code + HOOK)
     start = time.monotonic()
-    plugins = discover_in_sandbox((), LIMITS)
+    plugins = discover_in_sandbox((), Sandbox(()), MEMORY)
     assert {"rf", "clock"} <= plugins.offers.keys()
     assert plugins.offers["rf"].distribution == "oodd-eval"
     (broken,) = plugins.broken
@@ -120,7 +120,7 @@ def test_a_command_with_a_sandbox_imports_no_plug_in(option, monkeypatch, tmp_pa
 
 def test_a_run_in_a_sandbox_has_the_plan_of_a_plain_one():
     split = load_split("mini")
-    plain, boxed = discover(), discover_in_sandbox((), LIMITS)
+    plain, boxed = discover(), discover_in_sandbox((), Sandbox(()), MEMORY)
     names = [*plain.select("all"), *plain.select("sklearn:IsolationForest")]
     assert names == [*boxed.select("all"), *boxed.select("sklearn:IsolationForest")]
     assert plain.spec_forms() == boxed.spec_forms()
@@ -133,7 +133,7 @@ def test_a_run_in_a_sandbox_has_the_plan_of_a_plain_one():
 
 
 def test_names_and_parameters_that_nobody_offers_are_told_as_in_a_plain_run():
-    boxed = discover_in_sandbox((), LIMITS)
+    boxed = discover_in_sandbox((), Sandbox(()), MEMORY)
     with pytest.raises(UnknownNameError, match="did you mean 'mewma'"):
         boxed.offer("mewna")
     with pytest.raises(UsageError, match="IsolationForrest"):
@@ -145,14 +145,14 @@ def test_names_and_parameters_that_nobody_offers_are_told_as_in_a_plain_run():
 def test_one_sandbox_describes_a_distribution(monkeypatch):
     asked, plain = [], describe._Describer._ask
     monkeypatch.setattr(describe._Describer, "_ask", lambda *a: asked.append(a[1]) or plain(*a))
-    boxed = discover_in_sandbox((), LIMITS)
+    boxed = discover_in_sandbox((), Sandbox(()), MEMORY)
     assert boxed.offer("rf").spec.name == "rf"
     assert boxed.offer("pe").spec.name == "pe"
     assert asked == ["oodd-eval"]
 
 
 def test_a_detector_of_a_sandbox_cannot_be_made_in_the_command():
-    offer = discover_in_sandbox((), LIMITS).offer("clock")
+    offer = discover_in_sandbox((), Sandbox(()), MEMORY).offer("clock")
     with pytest.raises(ImportError, match="sandboxes alone"):
         offer.spec.factory(seed=0, horizon=1)
 
@@ -170,4 +170,4 @@ def test_an_editable_plug_in_is_found_in_a_sandbox(monkeypatch, tmp_path):
     install(monkeypatch, tmp_path / "odd", "odd", HOOK)
     os.renames(tmp_path / "odd" / "oodd_odd.py", tmp_path / "elsewhere" / "oodd_odd.py")
     monkeypatch.syspath_prepend(str(tmp_path / "elsewhere"))
-    assert discover_in_sandbox((), LIMITS).offer("odd").plugin == "odd"
+    assert discover_in_sandbox((), Sandbox(()), MEMORY).offer("odd").plugin == "odd"

@@ -16,12 +16,12 @@ import psutil
 import pytest
 from helpers_plugins import install
 from helpers_split import make_split
+from oodd_leaderboard.sandbox.launcher import Sandbox, make_sandbox
 
 from oodd_eval.data.split import SHIPPED
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import UsageError
 from oodd_eval.plugins.isolation.child import Limits
-from oodd_eval.plugins.isolation.sandbox import Sandbox, require_sandbox
 from oodd_eval.plugins.isolation.supervisor import run_isolated
 from oodd_eval.results.directory import ResultsDirectory
 
@@ -360,8 +360,11 @@ def acts(monkeypatch, tmp_path):
         request = {
             "plugin": "acts", "detector": name, "parameters": {}, "seed": 0, "horizon": 1,
         }  # fmt: skip
-        limits = Limits(**{"seconds": 60, "memory": 10**9} | limits, hidden=())
-        return run_isolated(request, nominal, [nominal] * 2, limits=limits, stop=lambda: False)
+        limits = Limits(**{"seconds": 60, "memory": 10**9} | limits)
+        return run_isolated(
+            request, nominal, [nominal] * 2,
+            limits=limits, stop=lambda: False, launcher=Sandbox(()),
+        )  # fmt: skip
 
     return run
 
@@ -427,7 +430,7 @@ def test_scores_are_those_of_a_plain_worker(tmp_path):
 def test_without_bubblewrap_the_command_says_what_to_install(monkeypatch, tmp_path):
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(UsageError, match="needs bubblewrap, the program bwrap"):
-        require_sandbox()
+        make_sandbox()
 
 
 def test_where_namespaces_are_forbidden_the_command_says_so(monkeypatch, tmp_path):
@@ -435,7 +438,7 @@ def test_where_namespaces_are_forbidden_the_command_says_so(monkeypatch, tmp_pat
     (tmp_path / "bwrap").chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
     with pytest.raises(UsageError, match="cannot make a sandbox here: No permissions"):
-        require_sandbox()
+        make_sandbox()
 
 
 def test_a_hidden_file_is_empty_and_a_hidden_directory_too(tmp_path, monkeypatch):
@@ -446,7 +449,7 @@ def test_a_hidden_file_is_empty_and_a_hidden_directory_too(tmp_path, monkeypatch
     monkeypatch.syspath_prepend(str(tmp_path / "path"))
     box = Sandbox([package / "data", package / "file", tmp_path / "nowhere"])
     look = f"ls {package}/data; cat {package}/file; ls {package}"
-    command, descriptors = box.command(["/bin/sh", "-c", look])
+    command, descriptors = box.wrap(["/bin/sh", "-c", look])
     done = subprocess.run(
         command, pass_fds=descriptors, env=box.environment(), capture_output=True, text=True,
         check=True,
@@ -454,3 +457,25 @@ def test_a_hidden_file_is_empty_and_a_hidden_directory_too(tmp_path, monkeypatch
     for descriptor in descriptors:
         os.close(descriptor)
     assert done.stdout.split() == ["__init__.py", "data", "file"]
+
+
+def test_a_directory_that_was_made_after_the_sandbox_is_hidden_too(tmp_path, monkeypatch):
+    package = tmp_path / "path" / "package"
+    package.mkdir(parents=True)
+    (package / "__init__.py").write_text("")
+    monkeypatch.syspath_prepend(str(tmp_path / "path"))
+    sandbox = Sandbox([package / "data"])
+    look = ["/bin/sh", "-c", f"cat {package}/data/x"]
+    for made in (False, True):
+        if made:
+            (package / "data").mkdir()
+            (package / "data" / "x").write_text("secret")
+        command, descriptors = sandbox.wrap(look)
+        done = subprocess.run(
+            command, pass_fds=descriptors, env=sandbox.environment(), capture_output=True,
+            check=False,
+        )  # fmt: skip
+        for descriptor in descriptors:
+            os.close(descriptor)
+        assert done.stdout == b""
+        assert b"No such file" in done.stderr

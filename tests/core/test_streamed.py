@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers_plugins import install
+from oodd_leaderboard.sandbox.launcher import Sandbox
 
 from oodd_eval import load_split
 from oodd_eval.data.parts import lengths_of, parts_of
@@ -68,8 +69,8 @@ def run_rows(detector, split, output=None, *, streamed=True, sandboxed=False, **
     opened, plugins = load_split(split), discover()
     plan = make_plan(plugins, split=opened, detectors=[detector], environments=["cartpole"],
                      anomalies=["iid"], parameters=parameters)  # fmt: skip
-    limits = Limits(120, hidden=() if sandboxed else None)
-    settings = RunSettings(jobs=1, limits=limits, streamed=streamed)
+    launcher = Sandbox(()) if sandboxed else None
+    settings = RunSettings(jobs=1, limits=Limits(120), launcher=launcher, streamed=streamed)
     results = ResultsDirectory(output) if output else None
     (record,) = run(plan, opened, plugins, settings, results).records
     if not output:

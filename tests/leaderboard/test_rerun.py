@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import pytest
 from helpers_submission import Draft
 from oodd_leaderboard.entry import read_entry
+from oodd_leaderboard.sandbox.launcher import make_sandbox
 from oodd_leaderboard.submit import Statement, submit
 from oodd_leaderboard.verify import verify_entry
 from oodd_leaderboard.verify.rerun import ORDER, read_order
@@ -23,7 +24,6 @@ from oodd_eval.data.facts import SPLITS
 from oodd_eval.data.split import load_split
 from oodd_eval.errors import ResultsError, UsageError
 from oodd_eval.plugins.discovery import discover
-from oodd_eval.plugins.isolation.sandbox import require_sandbox
 from oodd_eval.results.directory import ResultsDirectory
 
 pytestmark = pytest.mark.slow
@@ -133,7 +133,7 @@ def submitted(tmp_path_factory):
 @pytest.fixture
 def path(submitted, tmp_path, monkeypatch):
     """A copy of the entry, in a directory of entries of its own, whose split is a published one."""
-    require_sandbox()
+    make_sandbox()
     source, small = submitted
     monkeypatch.setattr(recording, "SPLITS", {**SPLITS, read_entry(source).meta.split: small})
     # The first draw is the same in every run of the tests, as one honest row in a hundred is
@@ -162,7 +162,7 @@ def test_rows_are_added_one_by_one_until_all_of_them_can_be_granted(path, capsys
     assert rerun(path) == 0
     assert "established here: re-run" in " ".join(capsys.readouterr().out.split())
     # What is finished is compared, and nothing is run or asked for.
-    for name in ("require_sandbox", "discovered", "record_split", "run"):
+    for name in ("make_sandbox", "discovered", "record_split", "run"):
         monkeypatch.setattr(recording, name, None)
     assert rerun(path, "--grant", "Hopper") == 0
     grant = read_entry(path).grant
@@ -236,10 +236,10 @@ def test_an_entry_that_knew_its_episodes_is_refused(path, capsys):
 
 
 def test_without_a_sandbox_nothing_is_drawn(path, monkeypatch, capsys):
-    def lacking():
+    def lacking(_):
         raise UsageError("no bubblewrap here")
 
-    monkeypatch.setattr(recording, "require_sandbox", lacking)
+    monkeypatch.setattr(recording, "make_sandbox", lacking)
     assert rerun(path) == 4
     assert "no bubblewrap here" in capsys.readouterr().err
     assert not (path.parents[1] / f"rerun-{path.name}").exists()

@@ -36,7 +36,6 @@ LONGEST_MESSAGE: Final = 2**24  # bytes of JSON
 HEADER_BYTES: Final = 4096  # of an array, at most
 LOG_BYTES: Final = 64_000  # of what is printed, the last ones are kept
 CHUNK: Final = 64  # trajectories that a worker scores at once
-PROCESSES: Final = 256  # at most, in a sandbox
 SCORED: Final = 93  # exit code of a process that has scored its group, and of no other
 
 MOST_PREFIXES: Final = 2000

@@ -15,10 +15,10 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, Protocol
 
 import psutil
 
@@ -29,11 +29,9 @@ from oodd_eval.plugins.isolation import (
     LOOK_SECONDS,
     MARK,
     POLL_SECONDS,
-    PROCESSES,
     Channel,
     end_all,
 )
-from oodd_eval.plugins.isolation.sandbox import Sandbox
 
 _SINGLE_THREAD: Final = (
     "OMP_NUM_THREADS",
@@ -52,14 +50,27 @@ _QUIET_ALLOCATOR: Final = {"JE_ARROW_MALLOC_CONF": "background_thread:false"}
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Wall-clock seconds and bytes of resident memory of one worker; None means no limit.
-
-    With `hidden`, the worker is in a sandbox, in which these paths are not to be seen.
-    """
+    """Wall-clock seconds and bytes of resident memory of one worker; None means no limit."""
 
     seconds: float | None = None
     memory: int | None = None
-    hidden: tuple[str, ...] | None = None
+
+
+class Launcher(Protocol):
+    """Starts processes of workers in a place of their own, such as a sandbox.
+
+    What it has started ends with it, and it ends with this process.
+    """
+
+    @property
+    def processes(self) -> int:
+        """Number of processes that a worker and all that it has started may be at a time."""
+
+    def wrap(self, command: Sequence[str]) -> tuple[list[str], list[int]]:
+        """Return the command that runs another one there, and descriptors that it reads."""
+
+    def environment(self) -> dict[str, str]:
+        """Return the variables that a worker has there beside those of the harness."""
 
 
 Stop = Callable[[], bool]  # tells whether the work is to end, such as `threading.Event.is_set`
@@ -77,16 +88,20 @@ class Child:
     """A module run as ``python -m MODULE CHANNEL_FD [LIFELINE_FD]``, within limits.
 
     It has no standard input, the import path of this process, one thread for numerical libraries,
-    and none of the variables that steer the harness. Outside a sandbox it has a lifeline, which the
-    system closes when this process is killed: see `oodd_eval.plugins.isolation.worker.connect`. A
-    thread keeps the limits; the limit of memory is for the process with all that it has started,
+    and none of the variables that steer the harness. Without a launcher it has a lifeline, which
+    the system closes when this process is killed: see `oodd_eval.plugins.isolation.worker.connect`.
+    A thread keeps the limits; the limit of memory is for the process with all that it has started,
     and seconds count from `start`, which may be set.
     After a limit was passed, or the process has ended, what was sent can still be read, and its
     channels then raise.
     """
 
     def __init__(
-        self, module: str, limits: Limits, stop: Stop | None = None, box: Sandbox | None = None
+        self,
+        module: str,
+        limits: Limits,
+        stop: Stop | None = None,
+        launcher: Launcher | None = None,
     ) -> None:
         self.start = time.monotonic()
         self._limits, self._stop = limits, stop
@@ -94,12 +109,13 @@ class Child:
         self.channel, remote = self._channel_pair()
         self._channels = [self.channel]
         lifeline, self._held = os.pipe()
-        passed = [remote] if box else [remote, lifeline]
-        self._mark, self._box, self._looked = secrets.token_hex(8), box, -math.inf
+        passed = [remote] if launcher else [remote, lifeline]
+        self._mark, self._looked = secrets.token_hex(8), -math.inf
+        self._launcher = launcher
         command = [sys.executable, "-P", "-m", module, *map(str, passed)]
-        environment = {**_environment(box), MARK: self._mark}
-        if box:
-            command, arguments = box.command(command)
+        environment = {**_environment(launcher), MARK: self._mark}
+        if launcher:
+            command, arguments = launcher.wrap(command)
             passed += arguments
         self._process = subprocess.Popen(  # noqa: S603  our own interpreter and module
             command,
@@ -167,7 +183,8 @@ class Child:
         self._ended.set()
         end_all(self._process.pid, self._mark)
         self.returncode = self._process.wait()
-        if self._box and 128 < self.returncode <= 128 + signal.NSIG:  # bubblewrap's for a signal
+        # Launchers report a signal as shells do.
+        if self._launcher and 128 < self.returncode <= 128 + signal.NSIG:
             self.returncode = 128 - self.returncode
         # A process that escaped could hold the output open for ever: do not wait for it.
         for thread in self._threads:
@@ -225,8 +242,8 @@ class Child:
             held, most = f"{used / 1e6:.0f} MB", f"{memory / 1e6:.0f} MB (--memory)"
             reason = f"resident memory {held} is over the limit of {most}"
             return GivenUpError("oom", reason, f"held {held}, more than {most}")
-        if self._box and processes > PROCESSES:
-            reason = f"started more than {PROCESSES} processes (--sandbox)"
+        if self._launcher and processes > self._launcher.processes:
+            reason = f"started more than {self._launcher.processes} processes (--sandbox)"
             return GivenUpError("error", reason, reason)
         return None
 
@@ -258,11 +275,11 @@ def _killed_for_memory() -> int:
     return 0
 
 
-def _environment(box: Sandbox | None) -> dict[str, str]:
+def _environment(launcher: Launcher | None) -> dict[str, str]:
     path = os.pathsep.join(str(Path(entry).absolute()) for entry in sys.path)
     # A detector must not see the harness's settings, nor the test that pytest names.
     steering = ("OODD_EVAL_", "PYTEST_CURRENT_TEST")
     variables = {n: value for n, value in os.environ.items() if not n.startswith(steering)}
-    kept = box.environment() if box else variables
+    kept = launcher.environment() if launcher else variables
     single = dict.fromkeys(_SINGLE_THREAD, "1")
     return {**kept, **single, **_QUIET_ALLOCATOR, "PYTHONPATH": path, "PYTHONHASHSEED": "0"}

@@ -26,8 +26,7 @@ from oodd_eval.plugins.isolation import (
     ChannelGarbledError,
     message_of,
 )
-from oodd_eval.plugins.isolation.child import Child, GivenUpError, Limits, Stop
-from oodd_eval.plugins.isolation.sandbox import Sandbox
+from oodd_eval.plugins.isolation.child import Child, GivenUpError, Launcher, Limits, Stop
 from oodd_eval.plugins.state import PackedState
 
 _FAILURES: Final = {"error", "oom", "invalid", "incompatible", "unavailable"}
@@ -65,6 +64,7 @@ def run_isolated(
     *,
     limits: Limits,
     stop: Stop,
+    launcher: Launcher | None = None,
     state: PackedState | None = None,
     keep: bool = False,
     streamed: bool = False,
@@ -73,9 +73,9 @@ def run_isolated(
     """Fit on `train` and score groups of trajectories, each group in a process of its own.
 
     A group's process is a fork of the fitted one. Where there can be none, as threads run on after
-    the fit or in a sandbox, it is a fresh one, which takes over the state of the fit; in a sandbox,
-    a detector without a state is fitted again in each. A detector that explains is asked to explain
-    the groups `explained` in the same way, last.
+    the fit or a launcher starts each process, it is a fresh one, which takes over the state of the
+    fit; with a launcher, a detector without a state is fitted again in each. A detector that
+    explains is asked to explain the groups `explained` in the same way, last.
 
     The request names ``plugin`` and ``detector``, its ``parameters``, ``seed``, ``horizon`` and
     perhaps ``baseline`` (see `make_detector`). `state` is that of an earlier fit, which replaces
@@ -87,7 +87,7 @@ def run_isolated(
     worker is killed and the status is ``"error"``. Only errors of reading the trajectories are
     raised.
     """
-    unit = _UnitRun(request, train, limits, stop, state, keep, streamed, progress)
+    unit = _UnitRun(request, train, limits, stop, launcher, state, keep, streamed, progress)
     try:
         unit.run(groups, explained)
     except GivenUpError as error:
@@ -103,6 +103,7 @@ class _UnitRun:
     train: Sequence[Trajectory]
     limits: Limits
     stop: Stop
+    launcher: Launcher | None
     state: PackedState | None
     keep: bool
     streamed: bool
@@ -113,11 +114,6 @@ class _UnitRun:
     peak: float = 0.0
     explains: bool = False
     updates: bool = False
-    box: Sandbox | None = None
-
-    def __post_init__(self) -> None:
-        if self.limits.hidden is not None:
-            self.box = Sandbox(self.limits.hidden)
 
     def run(
         self, groups: Iterable[Iterable[Trajectory]], explained: Iterable[Iterable[Trajectory]]
@@ -125,9 +121,9 @@ class _UnitRun:
         """Fit and score; `GivenUpError` for any failure."""
         with ExitStack() as stack:
             fitted = None
-            if not (self.box and self.state):
+            if not (self.launcher and self.state):
                 fitted = stack.enter_context(self._process())
-                if not self._fit(fitted, forks=not self.box):
+                if not self._fit(fitted, forks=not self.launcher):
                     stack.close()
                     fitted = None
             for group in groups:
@@ -153,7 +149,7 @@ class _UnitRun:
     def _process(self) -> Iterator[Child]:
         """Start a process, and end it after use; `GivenUpError` says how it failed."""
         module, gone = "oodd_eval.plugins.isolation.worker", None
-        with closing(Child(module, self.limits, self.stop, self.box)) as child:
+        with closing(Child(module, self.limits, self.stop, self.launcher)) as child:
             child.start = self.start
             try:
                 yield child

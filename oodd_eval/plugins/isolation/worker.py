@@ -324,7 +324,7 @@ def _end_children() -> None:
 def connect(arguments: Sequence[str]) -> Channel:
     """Return the channel to the harness, from the command line of a process that it has started.
 
-    Outside a sandbox, which ends by itself, a lifeline is named, too. The harness never writes to
+    Without a launcher, which ends by itself, a lifeline is named, too. The harness never writes to
     it: reading it ends when the harness is no more.
     """
     descriptors = [int(a) for a in arguments]

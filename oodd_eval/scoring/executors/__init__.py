@@ -8,7 +8,7 @@ from urllib.parse import urlsplit
 from oodd_eval.data.split import Split
 from oodd_eval.errors import UsageError
 from oodd_eval.plugins.contract import Progress, ignore_progress
-from oodd_eval.plugins.isolation.child import Limits
+from oodd_eval.plugins.isolation.child import Launcher, Limits
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.scoring.cores import available_cores
 from oodd_eval.scoring.unit import Scored, UnitJob
@@ -21,15 +21,16 @@ class RunSettings:
     """Settings of a run that change no metric.
 
     `jobs` are units at a time (None: one per core, or per thread of a cluster), `limits` those of
-    each worker. `fresh` fits again what the results directory has. `executor` is ``"local"`` or
-    ``"dask://HOST:PORT"``. After `deadline` seconds nothing new is begun. `command` is the command
-    line, for the provenance of records. `streamed` hands a detector one row at a time and waits for
-    its score before the next, as re-runs do. `row_metrics` adds metrics that are computed on
-    request.
+    each worker. A `launcher`, such as a sandbox, starts the workers of this machine. `fresh` fits
+    again what the results directory has. `executor` is ``"local"`` or ``"dask://HOST:PORT"``. After
+    `deadline` seconds nothing new is begun. `command` is the command line, for the provenance of
+    records. `streamed` hands a detector one row at a time and waits for its score before the next,
+    as re-runs do. `row_metrics` adds metrics that are computed on request.
     """
 
     jobs: int | None = None
     limits: Limits = field(default_factory=Limits)
+    launcher: Launcher | None = None
     fresh: bool = False
     stop_on_failure: bool = False
     executor: str = LOCAL
@@ -76,6 +77,8 @@ def open_executor(
     """Return the executor that the settings name."""
     if settings.executor == LOCAL:
         return Executor(settings, results, threading.Event())
+    if settings.launcher:
+        raise UsageError("--sandbox is for workers of this machine, without --executor")
     from oodd_eval.scoring.executors.dask import DaskExecutor  # noqa: PLC0415  an extra
 
     return DaskExecutor(f"tcp://{urlsplit(settings.executor).netloc}", settings, split, results)

@@ -1,4 +1,4 @@
-"""A sandbox for one worker, by bubblewrap: what it may read, where it may write, and nothing else.
+"""A launcher of workers, each in a sandbox of its own, which bubblewrap makes.
 
 The worker sees the system's programs and libraries, the interpreter and what can be imported, all
 read-only. Its home is ``/tmp``: memory of limited size, which is gone when the worker ends. It has
@@ -65,19 +65,26 @@ _SUFFIXES: Final = (
 
 
 class Sandbox:
-    """The place of workers, each of which has one of its own.
+    """Launcher of workers, each of which has a sandbox of its own.
 
     `hidden` are paths that they must not see, wherever they lie.
     """
 
-    def __init__(self, hidden: Iterable[str | Path]) -> None:
-        readable = tuple(dict.fromkeys(_readable()))
-        self._nobody = _may_be_nobody(readable)
-        self._mounts = [*_mounts(readable, [Path(os.path.realpath(path)) for path in hidden])]
+    processes = 256
 
-    def command(self, command: Sequence[str]) -> tuple[list[str], list[int]]:
+    def __init__(self, hidden: Iterable[str | Path]) -> None:
+        self._hidden = [Path(os.path.realpath(path)) for path in hidden]
+        self._mounts: dict[tuple[Path, ...], tuple[list[str], bool]] = {}
+
+    def wrap(self, command: Sequence[str]) -> tuple[list[str], list[int]]:
         """Return the command that runs another one in here, and descriptors that it reads."""
-        return _bubblewrap(self._mounts, command, nobody=self._nobody)
+        # Directories of results are made after the first sandboxes.
+        existing = tuple(path for path in self._hidden if path.exists())
+        if existing not in self._mounts:
+            readable = tuple(dict.fromkeys(_readable()))
+            self._mounts[existing] = [*_mounts(readable, existing)], _may_be_nobody(readable)
+        mounts, nobody = self._mounts[existing]
+        return _bubblewrap(mounts, command, nobody=nobody)
 
     def environment(self) -> dict[str, str]:
         """Return the variables of a worker: few of the user's, and an empty directory as home."""
@@ -85,15 +92,20 @@ class Sandbox:
         return kept | dict.fromkeys(("HOME", "TMPDIR", "XDG_CACHE_HOME"), SCRATCH)
 
 
-def require_sandbox() -> None:
-    """Raise `UsageError` if bubblewrap is not installed, or may not make a sandbox here."""
-    box = Sandbox(())
-    code, error = _run(*box.command([sys.executable, "-I", "-c", ""]), box.environment())
+def make_sandbox(hidden: Iterable[str | Path] = ()) -> Sandbox:
+    """Return a launcher, once a process has run in a sandbox.
+
+    Raises `UsageError` if bubblewrap is not installed, or may not make a sandbox here.
+    """
+    sandbox = Sandbox(hidden)
+    command, descriptors = sandbox.wrap([sys.executable, "-I", "-c", ""])
+    code, error = _run(command, descriptors, sandbox.environment())
     if code:
         raise UsageError(
             f"--sandbox: bubblewrap cannot make a sandbox here: {error.strip()[-300:]}; "
             "user namespaces have to be allowed"
         )
+    return sandbox
 
 
 def _run(
@@ -196,7 +208,7 @@ def _mounts(readable: Iterable[Path], hidden: Sequence[Path]) -> Iterator[str]:
         yield from ("--ro-bind", str(path), str(path))
     for secret in hidden:
         for path, target in targets.items():
-            if secret.exists() and secret.is_relative_to(target):
+            if secret.is_relative_to(target):
                 inside = path / secret.relative_to(target)
                 yield from _masked(str(inside), directory=secret.is_dir())
 

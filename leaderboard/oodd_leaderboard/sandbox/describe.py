@@ -27,10 +27,10 @@ from oodd_eval.plugins.discovery import (
     staying,
 )
 from oodd_eval.plugins.isolation import ChannelClosedError, ChannelGarbledError
-from oodd_eval.plugins.isolation.child import Child, GivenUpError, Limits
-from oodd_eval.plugins.isolation.sandbox import Sandbox
+from oodd_eval.plugins.isolation.child import Child, GivenUpError, Launcher, Limits
 from oodd_eval.plugins.isolation.worker import connect
-from oodd_eval.plugins.specs import MOST_SPECS, description_of, is_line, spec_of
+from oodd_eval.plugins.specs import MOST_SPECS, is_line
+from oodd_leaderboard.sandbox.specs import description_of, spec_of
 
 if TYPE_CHECKING:
     from oodd_eval.data.registry import Spec
@@ -43,13 +43,15 @@ _EXIT_SECONDS: Final = 2.0  # for a process that has closed its channel to end
 Answer = Mapping[str, Any]
 
 
-def discover_in_sandbox(disabled: Collection[str], limits: Limits) -> Plugins:
+def discover_in_sandbox(
+    disabled: Collection[str], launcher: Launcher, memory: int | None
+) -> Plugins:
     """Find the installed plug-ins, as `discover` does; what is needed of them a sandbox loads.
 
-    They neither observe runs nor offer environments, anomalies and readers. Of the limits, the
-    memory and the hidden paths count.
+    They neither observe runs nor offer environments, anomalies and readers. `memory` limits the
+    bytes of a process that loads them.
     """
-    return _Describer(disabled, limits).plugins
+    return _Describer(disabled, launcher, memory).plugins
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,9 +88,9 @@ class DescribedPlugin:
 class _Describer:
     """Has a sandbox load the plug-ins of a distribution, all at once, when one is needed."""
 
-    def __init__(self, disabled: Collection[str], limits: Limits) -> None:
+    def __init__(self, disabled: Collection[str], launcher: Launcher, memory: int | None) -> None:
         self.plugins = discover(disabled, load=self._load)
-        self._limits = Limits(SECONDS, limits.memory, limits.hidden or ())
+        self._launcher, self._limits = launcher, Limits(SECONDS, memory)
         self._answers: dict[tuple[str, str], Answer] = {}
 
     def _load(self, point: EntryPoint) -> DescribedPlugin:
@@ -113,8 +115,7 @@ class _Describer:
 
     def _ask(self, distribution: str, names: list[str], text: str = "") -> dict[str, Answer]:
         """Return the answers of plug-ins by name: nothing but a mapping is sure of each."""
-        box = Sandbox(self._limits.hidden or ())
-        with closing(Child(__name__, self._limits, None, box)) as child:
+        with closing(Child(__name__, self._limits, None, self._launcher)) as child:
             ending, answers = "", {}
             try:
                 child.channel.send({"distribution": distribution, "plugins": names, "make": text})

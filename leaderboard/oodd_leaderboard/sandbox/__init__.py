@@ -1,0 +1,1 @@
+"""Sandboxes for detectors of strangers: a launcher of workers, and plug-ins described in one."""
