@@ -1,7 +1,8 @@
 """Pages of the site from files outside of docs/, and links that work on both sides.
 
 MkDocs calls these functions while it builds (``hooks`` in mkdocs.yml). Pages that live beside what
-they describe, such as the detectors' READMEs, become pages of the site. A link to a file that has
+they describe, such as the detectors' READMEs, become pages of the site, and pages on environments
+are built. A link to a file that has
 no page leads into the repository, if pyproject.toml says where that is, or becomes its path in it.
 """
 
@@ -12,6 +13,7 @@ import re
 from pathlib import Path, PurePosixPath
 
 import click
+from figures import environments
 from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure import StructureItem
@@ -89,10 +91,13 @@ def _without(entries: list, missing: set[str]) -> list:
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the pages that live elsewhere."""
+    """Add the pages that live elsewhere, and those that are built."""
     for path in elsewhere():
         files.append(File.generated(config, path, abs_src_path=str(ROOT / path)))
-    for path, content in board().items():
+    pages = {f"{environments.NAME}/{name}": content for name, content in environments.built()}
+    for path, content in (board() | pages).items():
+        if written := files.get_file_from_path(path):  # by hand, perhaps of older strengths
+            files.remove(written)
         files.append(File.generated(config, path, content=content))
     return files
 
@@ -174,8 +179,10 @@ def board() -> dict[str, str | bytes]:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Turn links, formulas and the mark for commands into what the site shows."""
+    """Turn links, formulas and marks of built parts into what the site shows."""
     del config
+    pictures = {file.src_uri.removeprefix(f"{environments.NAME}/") for file in files}
+    markdown = environments.with_tables(markdown, pictures)
     outside = {*elsewhere()}
     source = page.file.src_uri
     source = source if source in outside else DOCS + source

@@ -49,7 +49,7 @@ NOT_RUN = [
     Rule(r"^(mkdir|cp) ", "moves what a command of PARSED_ONLY would have made"),
     Rule(r"^(dask |dask-)", "servers that stay; test_executors starts them"),
     Rule(r"^python docs/figures/make\.py$", "test_figures_are_what_the_script_draws runs it"),
-    Rule(r"^python docs/figures/environments\.py$", "test_page calls it"),
+    Rule(r"^python docs/figures/environments\.py$", "test_page calls what it does"),
     Rule(r"^mkdocs build", "the fixture of test_docs runs it"),
     Rule(r"\bskab\b", "needs files that others published; test_recipes has some of their shape"),
     Rule(r"^python benchmarks/(?:public_logs|promises)\.py", "the same, and minutes"),

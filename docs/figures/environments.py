@@ -1,29 +1,31 @@
-"""Write the pages "Environments and anomalies": an overview, and a page for each environment.
+"""Build the pages on environments and the tables of the page "Environments and anomalies".
 
-``python docs/figures/environments.py [DIRECTORY]`` writes them, here unless told otherwise. A page
-is what ``oodd-eval data page`` writes; those of the benchmark also say what the paper has, and what
-only a person can write, from ``environments.toml``.
+The documents' site builds them (``docs/hooks.py``), and they are not committed.
+``python docs/figures/environments.py [DIRECTORY]`` writes the pages with their pictures, by default
+to ``docs/environments``. A page is what ``oodd-eval data page`` writes. Pages of the benchmark also
+say what the paper has, and what only a person can write, from ``environments.toml``.
 """
 
 import argparse
 import json
+import re
 import tomllib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 from oodd_recording.benchmark import FROZEN
-from oodd_recording.page import INTERVALS, LEVELS, Page, table, write_page
+from oodd_recording.page import INTERVALS, LEVELS, Page, table
 from oodd_recording.values import VALUES, spread_of
 from oodd_worlds import oodd_anomalies, oodd_environments
 
 from oodd_eval.data.condition import PAPER, ROBOTS_CAP, RUNGS, WHOLE, ladder_of, rungs_of
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, WORLDS
-from oodd_eval.data.files import write_text
+from oodd_eval.data.files import write_bytes
 from oodd_eval.data.registry import AnomalySpec, environment_spec, register, registered
+from oodd_eval.errors import MissingExtraError
 
 NAME: Final = "environments"
-COMMAND: Final = "python docs/figures/environments.py"
 OVERVIEW_RUNG: Final = "kept90"
 WORLDS_RUNG: Final = "loss10"
 LINKS: Final = f"""[All environments and kinds](../{NAME}.md) ·
@@ -43,21 +45,23 @@ _ATTRIBUTES: Final = {
 }
 
 
-def write_pages(
-    directory: Path,
-    *,
-    environments: Iterable[str] = (*ENVIRONMENTS, *WORLDS),
-    progress: Callable[[str], None] = lambda _text: None,
-) -> None:
-    """Write the overview, ``environments.md``, and the pages with their pictures below it.
+def built(environments: Iterable[str] = (*ENVIRONMENTS, *WORLDS)) -> Iterator[tuple[str, bytes]]:
+    """Build pages and their pictures.
 
-    The overview names all environments; `progress` is called with the name of each when its files
-    are written.
+    Yields
+    ------
+    tuple
+        The name of a file, relative to ``docs/environments``, and its content. A page has no
+        pictures where its simulator is not installed, as PyBullet on newer Pythons.
     """
-    write_text(directory / f"{NAME}.md", overview())
     for environment in environments:
-        write_page(page_of(environment), directory / NAME)
-        progress(environment)
+        page = page_of(environment)
+        try:
+            pictures = dict(page.pictures())
+        except MissingExtraError:
+            pictures = {}
+        yield f"{environment}.md", page.text(pictures).encode()
+        yield from pictures.items()
 
 
 def page_of(environment: str) -> Page:
@@ -72,86 +76,76 @@ def _register_worlds() -> None:
     register([*oodd_environments(), *oodd_anomalies()])
 
 
-def overview() -> str:
-    """Return the text of ``environments.md``."""
+def with_tables(text: str, pictures: Container[str] = ()) -> str:
+    """Return the text of ``docs/environments.md`` with its tables.
+
+    Parameters
+    ----------
+    text
+        Markdown with marks such as ``<!-- built: strengths -->``.
+    pictures
+        Names of the files of `built`; the tables show frames and drawings among these.
+    """
     _register_worlds()
-    environments = [
+    tables = {
+        "environments": lambda: _environments(pictures),
+        "kinds": _kinds,
+        "strengths": _strengths,
+        "worlds": lambda: _worlds(pictures),
+        "kinds of worlds": _kinds_of_worlds,
+    }
+    return re.sub("<!-- built: ([a-z ]+) -->", lambda match: tables[match[1]](), text)
+
+
+def _image(name: str, alt: str, pictures: Container[str]) -> str:
+    return f'<img src="{NAME}/{name}" alt="{alt}" width="160">' if name in pictures else ""
+
+
+def _environments(pictures: Container[str]) -> str:
+    rows = [
         (
             f"[{e}]({NAME}/{e}.md)",
-            f'<img src="{NAME}/{e}.png" alt="{i.title}: a frame" width="160">',
+            _image(f"{e}.png", f"{i.title}: a frame", pictures),
             *_returns(e),
             i.observation_dim,
             f"{i.action_dim}{', one a step' * i.discrete}",
         )
         for e, i in ENVIRONMENTS.items()
     ]
-    kinds = [(f"`{k}`", a.title, a.group, a.summary) for k, a in ANOMALIES.items()]
-    strengths = [
-        (f"`{k}`", *(_strength(e, k, OVERVIEW_RUNG) for e in ENVIRONMENTS)) for k in ANOMALIES
-    ]
-    columns = ("environment", "", "return", "the paper's", "sensors", "actions")
-    return f"""# Environments and anomalies
-
-There are {len(ENVIRONMENTS)} environments with a trained policy each, and {len(ANOMALIES)} kinds of
-anomalies. Each environment has a page: its sensors and actions, and for each kind what it does
-there, its strengths, what they cost the policy, and an episode beside its twin. These pages are
-written by `{COMMAND}`.
-
-## Environments
-
-{table(environments, columns)}
-
-Returns are means over 100 episodes of the frozen policy, with their standard deviation; the
-paper's are those of its Table 2. Frames are half-way through an episode.
-
-## Kinds of anomalies
-
-The first {len(TABLE1)} are the paper's. A sensor anomaly corrupts what sensors say, and the policy
-acts on it; an anomaly of the dynamics changes what happens. Both begin at an onset and last to the
-end.
-
-{table(kinds, ("kind", "name", "group", "what it does"))}
-
-## Strengths
-
-The strength at which the policy keeps 90 % of its return (`{OVERVIEW_RUNG}`), linked to all that is
-known of the kind there; `> 1` where the largest sensible strength, 1, costs less. Where a ladder
-has no rung of that name, as the next weaker one costs more already, that one is shown. Units differ
-between kinds, and some between environments; they stand on the pages.
-
-{table(strengths, ("kind", *ENVIRONMENTS))}
-
-{_worlds()}"""
+    return table(rows, ("environment", "", "return", "the paper's", "sensors", "actions"))
 
 
-def _worlds() -> str:
-    """Return the section on the worlds of the overview."""
-    specs = [environment_spec(world) for world in WORLDS]
-    worlds = [
+def _kinds() -> str:
+    rows = [(f"`{k}`", a.title, a.group, a.summary) for k, a in ANOMALIES.items()]
+    return table(rows, ("kind", "name", "group", "what it does"))
+
+
+def _strengths() -> str:
+    rows = [(f"`{k}`", *(_strength(e, k, OVERVIEW_RUNG) for e in ENVIRONMENTS)) for k in ANOMALIES]
+    return table(rows, ("kind", *ENVIRONMENTS))
+
+
+def _worlds(pictures: Container[str]) -> str:
+    rows = [
         (
             f"[{s.name}]({NAME}/{s.name}.md)",
-            f'<img src="{NAME}/{s.name}.svg" alt="{s.title}: a drawing" width="160">',
+            _image(f"{s.name}.svg", f"{s.title}: a drawing", pictures),
             sum(sensor.role == "measured" for sensor in s.sensors),
             len(s.actions),
         )
-        for s in specs
+        for s in map(environment_spec, WORLDS)
     ]
-    kinds = [
+    return table(rows, ("world", "", "measured sensors", "actions"))
+
+
+def _kinds_of_worlds() -> str:
+    rows = [
         (f"`{k.name}`", world, k.group, k.summary, _strength(world, k.name, WORLDS_RUNG))
         for world in WORLDS
         for k in registered()
         if isinstance(k, AnomalySpec) and (k.environments == (world,) or k.name in ladder_of(world))
     ]
-    return f"""## Worlds
-
-{len(WORLDS)} environments of the plug-in `oodd_worlds`, with classical controllers, noisy sensors
-and parameters that differ from episode to episode. The strength is that at which the task's loss
-grows by a tenth (`{WORLDS_RUNG}`).
-
-{table(worlds, ("world", "", "measured sensors", "actions"))}
-
-{table(kinds, ("kind", "world", "group", "what it does", "strength"))}
-"""
+    return table(rows, ("kind", "world", "group", "what it does", "strength"))
 
 
 class BenchmarkPage(Page):
@@ -265,5 +259,9 @@ def _returns(environment: str) -> tuple[str, str]:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("directory", type=Path, nargs="?", default=Path(__file__).parents[1])
-    write_pages(parser.parse_args().directory, progress=print)
+    default = Path(__file__).parents[1] / NAME
+    parser.add_argument("directory", type=Path, nargs="?", default=default)
+    directory = parser.parse_args().directory
+    for name, content in built():
+        write_bytes(directory / name, content)
+        print(directory / name)

@@ -4,7 +4,7 @@
 more (``docs/figures/environments.py``).
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
@@ -48,6 +48,9 @@ _PLOTS: Final = (
     "onset: of\nthe sensors that may have changed, the one that differs most. A dot marks the end "
     "of the episode."
 )
+_NO_PLOTS: Final = (
+    "Its simulator was not installed where this page was built: episodes are not plotted."
+)
 _NOISE: Final = (
     " The noise is\nthe standard deviation of what is added to each row before the controller sees "
     "it."
@@ -87,25 +90,26 @@ class Page:
 
     # What is asked of a page
 
-    def text(self, picture: str = "") -> str:
+    def text(self, pictures: Collection[str] = ()) -> str:
         """Return the Markdown.
 
         Parameters
         ----------
-        picture
-            Name of the file with the picture of the environment, beside the page; empty for none.
+        pictures
+            Names of the files that `pictures` yielded; the page shows these.
         """
         lead, heading, sections = f"\n{self.description()}".partition("\n## ")
-        what = "a frame half-way through an episode" if picture.endswith(".png") else "a drawing"
+        shown = {"png": "a frame half-way through an episode", "svg": "a drawing"}
+        files = ((f"{self.environment}.{suffix}", alt) for suffix, alt in shown.items())
         parts = [
             f"# {self.info.title}",
-            picture and f"![{self.info.title}: {what}]({picture})",
+            *(f"![{self.info.title}: {alt}]({name})" for name, alt in files if name in pictures),
             lead.strip(),
             table(self.facts(), ("", f"`{self.environment}`")),
             self.links,
             f"{heading}{sections}".strip(),
             *self._columns(),
-            *(self._anomalies() if self.kinds else ()),
+            *(self._anomalies(pictures) if self.kinds else ()),
         ]
         return "\n\n".join(filter(None, parts)) + "\n"
 
@@ -205,17 +209,22 @@ class Page:
         else:
             yield f"All of them are commanded in each step{'' if scaled else ', from -1 to 1'}."
 
-    def _anomalies(self) -> Iterator[str]:
+    def _anomalies(self, pictures: Collection[str]) -> Iterator[str]:
         """Return the sections on anomalies."""
+        plots = {kind: f"{self.environment}/{kind}.svg" for kind in self.kinds}
         yield "## Anomalies"
         if self.ladder:
             yield self.levels()
-        yield _PLOTS
+        yield _PLOTS if {*plots.values()} & {*pictures} else _NO_PLOTS
         if self.further and self.environment not in ENVIRONMENTS:
             names = ", ".join(f"`{kind}`" for kind in self.further)
             yield f"These kinds can be recorded as well: {names}."
         for kind in self.kinds:
             yield from self._kind(kind)
+            if plots[kind] in pictures:
+                name, strength = self.pictured(kind)
+                about = f"One sensor of an episode under {kind} at {name} ({strength:g})"
+                yield f"![{about}, and of its twin]({plots[kind]})"
 
     def _kind(self, kind: str) -> Iterator[str]:
         """Return the section on a kind of anomaly."""
@@ -229,9 +238,6 @@ class Page:
             rungs = all_rungs_of(self.environment, kind)
             rows = [_rung(name, rung, self.spec.task) for name, rung in rungs.items()]
             yield table(rows, ("rung", "strength", cost, "reached"))
-        name, strength = self.pictured(kind)
-        about = f"One sensor of an episode under {kind} at {name} ({strength:g}), and of its twin"
-        yield f"![{about}]({self.environment}/{kind}.svg)"
 
 
 def _quantities(kind: str, quantities: Sequence[Quantity]) -> dict[str, Sequence[Any]]:
@@ -290,11 +296,11 @@ def write_page(
     pathlib.Path
         The page.
     """
-    picture = ""
+    pictures = []
     for name, content in page.pictures():
-        picture = name if "/" not in name else picture
         write_bytes(directory / name, content)
+        pictures.append(name)
         progress(name)
     path = directory / f"{page.environment}.md"
-    write_text(path, page.text(picture))
+    write_text(path, page.text(pictures))
     return path

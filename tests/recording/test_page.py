@@ -17,15 +17,11 @@ from oodd_recording.record import RecordedEpisode
 from oodd_eval.cli.main import main
 from oodd_eval.data.condition import Rung
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, WORLDS
-from oodd_eval.data.registry import environment_spec
 from oodd_eval.data.trajectory import Trajectory
+from oodd_eval.errors import MissingExtraError
 
 sys.path.insert(0, str(ROOT / "docs" / "figures"))
 import environments as page
-
-DOCS = ROOT / "docs"
-PAGES = DOCS / page.NAME
-STALE = f"is not what `{page.COMMAND}` writes: run it in the root of the repository"
 
 
 @pytest.fixture(autouse=True)
@@ -33,37 +29,6 @@ def forgotten():
     """No environment of one test is known in the next."""
     yield
     forget_own()
-
-
-def test_committed_texts_are_those_of_the_present_numbers():
-    texts = {f"{page.NAME}/{e}.md": page.page_of(e).text(f"{e}.png") for e in ENVIRONMENTS}
-    for name, text in {f"{page.NAME}.md": page.overview(), **texts}.items():
-        assert (DOCS / name).read_text("utf-8") == text, f"docs/{name} {STALE}"
-
-
-@pytest.mark.parametrize("world", WORLDS)
-def test_committed_pages_of_worlds_are_those_of_the_present_facts(world):
-    pytest.importorskip("mujoco", reason="needs the extra worlds")
-    written = page.page_of(world)
-    committed, text = (PAGES / f"{world}.md").read_text("utf-8"), written.text(f"{world}.svg")
-    # Another version of the simulator makes no page stale.
-    committed, text = (re.sub(r"(\| simulated by \|).*", r"\1", t) for t in (committed, text))
-    assert committed == text, f"docs/{page.NAME}/{world}.md {STALE}"
-    drawing = environment_spec(world).picture()
-    assert (PAGES / f"{world}.svg").read_text("utf-8") == drawing, f"{world}.svg {STALE}"
-
-
-@pytest.mark.parametrize("environment", [*ENVIRONMENTS, *WORLDS])
-def test_committed_pictures_are_those_of_the_present_strengths(environment):
-    if environment in WORLDS:
-        pytest.importorskip("mujoco", reason="needs the extra worlds")
-    of_environment = page.page_of(environment)
-    drawn = {path.stem: path.read_text() for path in (PAGES / environment).iterdir()}
-    assert set(drawn) == {*of_environment.kinds}, f"docs/{page.NAME}/{environment} {STALE}"
-    for kind in of_environment.kinds:
-        rung, strength = of_environment.pictured(kind)
-        title = f">{kind} at {rung} ({strength:g})<"
-        assert title in drawn[kind], f"docs/{page.NAME}/{environment}/{kind}.svg {STALE}"
 
 
 def test_drawn_links_lie_where_the_simulator_has_them():
@@ -102,12 +67,36 @@ def test_an_overview_names_the_strength_that_levels_share_or_that_none_reaches(m
         assert page._strength("hopper", "iid", "kept90") == f"[{text}](environments/hopper.md#iid)"
 
 
-def test_overview_page_and_pictures_are_written(tmp_path):
-    page.write_pages(tmp_path, environments=["cartpole"])
-    written = {p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*") if p.is_file()}
-    plots = {f"environments/cartpole/{kind}.svg" for kind in ANOMALIES}
-    pages = {"environments.md", "environments/cartpole.md", "environments/cartpole.png"}
-    assert written == pages | plots
+@pytest.mark.parametrize(("environment", "picture"), [("cartpole", "png"), ("tank", "svg")])
+def test_pages_are_built_with_a_section_and_a_plot_for_each_kind(environment, picture):
+    files = dict(page.built([environment]))
+    text = files.pop(f"{environment}.md").decode()
+    kinds = page.page_of(environment).kinds
+    assert {*files} == {f"{environment}.{picture}", *(f"{environment}/{k}.svg" for k in kinds)}
+    assert {*re.findall(r"!\[[^\]]+\]\(([^)]+)\)", text)} == {*files}
+    assert re.findall("^### (.+)$", text, re.MULTILINE) == kinds
+    for kind in kinds:
+        rung, strength = page.page_of(environment).pictured(kind)
+        assert f">{kind} at {rung} ({strength:g})<" in files[f"{environment}/{kind}.svg"].decode()
+
+
+def test_pages_have_no_pictures_without_a_simulator(monkeypatch):
+    def missing(_):
+        raise MissingExtraError("recording needs the simulators")
+
+    monkeypatch.setattr(page.Page, "pictures", missing)
+    ((name, text),) = page.built(["hopper"])
+    assert name == "hopper.md"
+    assert "![" not in text.decode()
+
+
+def test_every_environment_and_kind_is_in_the_tables_of_the_overview():
+    committed = (ROOT / "docs" / "environments.md").read_text("utf-8")
+    text = page.with_tables(committed, {"hopper.png", "arm.svg"})
+    assert "<!-- built" not in text
+    assert re.findall(r"^\| \[(\w+)\]", text, re.MULTILINE) == [*ENVIRONMENTS, *WORLDS]
+    assert {*ANOMALIES} <= {*re.findall(r"^\| `([\w-]+)`", text, re.MULTILINE)}
+    assert re.findall(r'<img src="environments/([\w.]+)"', text) == ["hopper.png", "arm.svg"]
 
 
 @pytest.mark.parametrize("environment", ENVIRONMENTS)
