@@ -1,9 +1,9 @@
 """Pages of the site from files outside of docs/, and links that work on both sides.
 
-MkDocs calls these functions while it builds (``hooks`` in mkdocs.yml). Pages that live beside what
-they describe, such as the detectors' READMEs, become pages of the site, and pages on environments
-are built. A link to a file that has
-no page leads into the repository, if pyproject.toml says where that is, or becomes its path in it.
+ProperDocs calls these functions while it builds (``hooks`` in properdocs.yml). Pages that live
+beside what they describe, such as the detectors' READMEs, become pages of the site, and pages on
+environments are built. A link to a file that has no page leads into the repository, if
+pyproject.toml says where that is, or becomes its path in it.
 """
 
 import html
@@ -15,14 +15,14 @@ from pathlib import Path, PurePosixPath
 import click
 from figures import environments
 from latex2mathml.converter import convert
-from mkdocs.config.defaults import MkDocsConfig
-from mkdocs.structure import StructureItem
-from mkdocs.structure.files import File, Files
-from mkdocs.structure.nav import Navigation
-from mkdocs.structure.pages import Page
 from oodd_leaderboard import site
 from oodd_leaderboard.build import CELLS, cells
 from oodd_leaderboard.entry import read_entries, sections, suite_sections
+from properdocs.config.defaults import ProperDocsConfig
+from properdocs.structure import StructureItem
+from properdocs.structure.files import File, Files
+from properdocs.structure.nav import Navigation
+from properdocs.structure.pages import Page
 
 from oodd_eval._version import repository
 from oodd_eval.cli.main import PROGRAM
@@ -67,7 +67,7 @@ def elsewhere() -> list[str]:
     return [path.relative_to(ROOT).as_posix() for path in found]
 
 
-def on_config(config: MkDocsConfig) -> MkDocsConfig:
+def on_config(config: ProperDocsConfig) -> ProperDocsConfig:
     """Link to the repository, if it has an address, and leave out results while there are none."""
     config.repo_url = config.repo_url or repository() or None
     missing = set() if (ROOT / RESULTS[0]).exists() else set(RESULTS)
@@ -90,7 +90,7 @@ def _without(entries: list, missing: set[str]) -> list:
     return kept
 
 
-def on_files(files: Files, config: MkDocsConfig) -> Files:
+def on_files(files: Files, config: ProperDocsConfig) -> Files:
     """Add the pages that live elsewhere, and those that are built."""
     for path in elsewhere():
         files.append(File.generated(config, path, abs_src_path=str(ROOT / path)))
@@ -102,14 +102,14 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     return files
 
 
-def on_nav(nav: Navigation, config: MkDocsConfig, files: Files) -> Navigation:
+def on_nav(nav: Navigation, config: ProperDocsConfig, files: Files) -> Navigation:
     """Keep the navigation, from which the index for language models is written at the end."""
     del files
     config.extra[LLMS] = nav
     return nav
 
 
-def on_page_content(content: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+def on_page_content(content: str, page: Page, config: ProperDocsConfig, files: Files) -> str:
     """Describe a page by its first sentence, or by more of them where the first is short."""
     del config, files
     texts = (_plain(paragraph) for paragraph in PARAGRAPH.findall(content))
@@ -126,14 +126,14 @@ def _plain(text: str) -> str:
     return plain.removeprefix("Context. ")
 
 
-def on_post_build(config: MkDocsConfig) -> None:
+def on_post_build(config: ProperDocsConfig) -> None:
     """Write the index for language models, and mend that of the search."""
     index = llms(config.extra.pop(LLMS), config)
     (Path(config.site_dir) / LLMS).write_text(index, encoding="utf-8")
     _mend_search(Path(config.site_dir) / "search" / "search_index.json")
 
 
-def llms(nav: Navigation, config: MkDocsConfig) -> str:
+def llms(nav: Navigation, config: ProperDocsConfig) -> str:
     """Return the text of llms.txt: each page with address, title and first sentence."""
     base = config.site_url or ""
     sections: dict[str, list[str]] = {}
@@ -178,7 +178,7 @@ def board() -> dict[str, str | bytes]:
     return {f"{BOARD}/{name}": content for name, content in files.items()}
 
 
-def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+def on_page_markdown(markdown: str, page: Page, config: ProperDocsConfig, files: Files) -> str:
     """Turn links, formulas and marks of built parts into what the site shows."""
     del config
     pictures = {file.src_uri.removeprefix(f"{environments.NAME}/") for file in files}
@@ -199,7 +199,7 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
 
 def _link(found: re.Match[str], source: str, uri: str, pages: dict[str, str]) -> str:
-    """Return a link of a page as the site has it; what leads nowhere stays, and MkDocs says so."""
+    """Return a link of a page as the site has it; one that leads nowhere stays, for a warning."""
     text, target, anchor = found[1], found[2], found[3] or ""
     path = os.path.normpath(PurePosixPath(source).parent / target)
     if path == "README.md":

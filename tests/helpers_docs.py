@@ -50,7 +50,7 @@ NOT_RUN = [
     Rule(r"^(dask |dask-)", "servers that stay; test_executors starts them"),
     Rule(r"^python docs/figures/make\.py$", "test_figures_are_what_the_script_draws runs it"),
     Rule(r"^python docs/figures/environments\.py$", "test_page calls what it does"),
-    Rule(r"^mkdocs build", "the fixture of test_docs runs it"),
+    Rule(r"^properdocs build", "the fixture of test_docs runs it"),
     Rule(r"\bskab\b", "needs files that others published; test_recipes has some of their shape"),
     Rule(r"^python benchmarks/(?:public_logs|promises)\.py", "the same, and minutes"),
 ]

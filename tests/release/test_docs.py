@@ -24,12 +24,12 @@ FIGURES = DOCS / "figures"
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
-    """The built site; whatever MkDocs warns of is an error."""
+    """The built site; whatever ProperDocs warns of is an error."""
     directory = tmp_path_factory.mktemp("site")
     # Its theme advertises on the terminal.
     env = {**os.environ, "NO_MKDOCS_2_WARNING": "1", "COLUMNS": "200"}
     done = subprocess.run(
-        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", directory],
+        [sys.executable, "-m", "properdocs", "build", "--strict", "--site-dir", directory],
         cwd=ROOT, env=env, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
@@ -83,7 +83,7 @@ def test_every_document_is_a_page(site):
 
 
 def test_no_page_is_twice_in_the_navigation():
-    navigation = (ROOT / "mkdocs.yml").read_text().partition("\nnav:\n")[2]
+    navigation = (ROOT / "properdocs.yml").read_text().partition("\nnav:\n")[2]
     pages = re.findall(r"\S+\.(?:md|html)$", navigation, re.MULTILINE)
     assert sorted(pages) == sorted({*pages})
 
@@ -93,7 +93,7 @@ def test_the_index_for_language_models_describes_every_page_of_the_navigation(si
     title, summary, *sections = (site / "llms.txt").read_text().split("\n\n")
     assert title == "# oodd-eval"
     assert summary.startswith("> Evaluation harness and leaderboard")
-    navigation = (ROOT / "mkdocs.yml").read_text().partition("\nnav:\n")[2]
+    navigation = (ROOT / "properdocs.yml").read_text().partition("\nnav:\n")[2]
     sources = re.findall(r"\S+\.(?:md|html)$", navigation, re.MULTILINE)
     lines = "\n".join(part for part in sections if not part.startswith("## ")).splitlines()
     links = [re.fullmatch(r"- \[(.+)\]\(([^()]+)\)(?:: (.{20,}))?", line) for line in lines]
