@@ -2,82 +2,56 @@
 
 A table below a comment such as ``<!-- table: board mini -->`` has rows whose first cell the author
 writes; this program writes the other cells. Run ``python docs/figures/tables.py`` after a change of
-committed results, or of the rows; with ``--check`` it writes nothing and fails where a page would
-change.
+committed results, or of the rows. With ``--check`` it writes nothing, and fails where a number of a
+document is not that of what is committed: in these tables, in sentences beside them
+(``sentences.py``), in the README's output, on pages of suites and on the board.
 """
 
-import csv
 import functools
+import io
 import json
+import os
 import re
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import redirect_stdout
+from itertools import zip_longest
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from unittest.mock import patch
 
-from oodd_leaderboard.entry import read_entries
+import sentences
+from committed import (
+    BOARD,
+    README,
+    RESULTS,
+    ROOT,
+    Row,
+    board,
+    cells,
+    claims,
+    entries,
+    mean,
+    of_reproductions,
+    overview,
+    ranking,
+)
+from oodd_leaderboard.build import documents
+from oodd_leaderboard.entry import sections, suite_sections
 
+from oodd_eval.cli.main import main as oodd_eval
+from oodd_eval.data.files import read_text
 from oodd_eval.metrics.catalogue import metric_info
 from oodd_eval.results.board import Board, boards
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.strengths import DETECTION, Strengths
 
-ROOT = Path(__file__).parents[2]
-BOARD = ROOT / "leaderboard"
-PAGES = (ROOT / "README.md", ROOT / "docs" / "results.md")
+PAGES = (README, RESULTS)
 LOGS = ("skab", "alfa", "rosa", "tep", "nab", "uci", "ur3", "pi0-libero")
 """Sets of public logs that have anomalous episodes, in the order of columns."""
 
 HEADLINE = ("auc_matched", "found_within_20_at_5pct", "missed_at_5pct")
-
-Row = Callable[[str], str]
-"""Return the cells of a row behind its first one, separated by bars, from what the first names."""
-
-
-def lines(path: str) -> list[dict[str, str]]:
-    """Return the rows of a committed CSV file."""
-    with (BOARD / path).open(encoding="utf-8") as file:
-        return list(csv.DictReader(file))
-
-
-@functools.cache
-def ranking(split: str) -> dict[str, dict[str, str]]:
-    """Return the primary rows of a board by detector."""
-    (file,) = (BOARD / "tables").glob(f"{split}-*-ranking.csv")
-    rows = lines(str(file.relative_to(BOARD)))
-    return {row["detector"]: row for row in rows if row["primary"] == "true"}
-
-
-@functools.cache
-def board(name: str) -> Board:
-    """Return a suite's board, or that of the entries on mini."""
-    if name == "mini":
-        records = [r for e in read_entries(BOARD / "results") for r in e.records]
-        records = [r for r in records if r.split == "mini"]
-    else:
-        records = ResultsDirectory(BOARD / "suites" / name).records()
-    (of_split,) = boards(records)
-    return of_split
-
-
-def mean(
-    name: str,
-    row: str | Setting,
-    metric: str,
-    *,
-    environments: Iterable[str] = (),
-    anomalies: Iterable[str] = (),
-) -> float:
-    """Return a row's mean of a metric in per cent, by default over all cells."""
-    records = board(name)
-    setting = row if isinstance(row, Setting) else Setting(row)
-    over = [*environments] or records.environments, [*anomalies] or records.anomalies
-    return 100 * records.mean(setting, *over, metric).value
-
-
-def cells(values: Iterable[float]) -> str:
-    """Return numbers with one decimal as cells."""
-    return " | ".join(f"{value:.1f}" for value in values)
 
 
 def of_board(split: str, *metrics: str) -> Row:
@@ -181,33 +155,6 @@ def of_rerun(name: str) -> str:
     return cells(100 * value for metric in metrics for value in run_again()[name][metric])
 
 
-def of_reproductions(table1: str, losses: str) -> Row:
-    """Return AUC by group of a model: of the paper, at Table 1's strengths, at equal losses."""
-
-    def means(split: str) -> dict[tuple[str, str], dict[str, str]]:
-        rows = lines(f"reproduction/{split}/tables/table-5.csv")
-        rows = [r for r in rows if (r["environment"], r["metric"]) == ("mean", "auc")]
-        return {(r["series"], r["anomalies"]): r for r in rows}
-
-    def row(name: str) -> str:
-        ours, same = means(table1), means(losses)
-        keys = [(name, group) for group in ("sensor", "dynamics")]
-        texts = (t for k in keys for t in (same[k]["paper"], ours[k]["value"], same[k]["value"]))
-        return cells(100 * float(text) for text in texts)
-
-    return row
-
-
-def overview(suite: str, name: str) -> list[str]:
-    """Return the cells of a row of detection thresholds on a suite's page."""
-    page = (BOARD / "suites" / suite / "README.md").read_text(encoding="utf-8")
-    table = page.partition("\n### Detection thresholds, lower is better")[2].split("\n\n")[1]
-    rows = [[cell.strip().replace("\\", "") for cell in line.split("|")[1:-1]]
-            for line in table.splitlines()]  # fmt: skip
-    (row,) = (row for row in rows if row[0] == name)
-    return row
-
-
 def thresholds(suite: str, name: str) -> list[str]:
     """Return the threshold of a row on a suite's page, and the shares that it finds by rung."""
     row = overview(suite, name)
@@ -266,12 +213,6 @@ def on_logs(metric: str = "") -> Row:
     return lambda name: " | ".join(value(logs()[environment], name) for environment in LOGS)
 
 
-@functools.cache
-def claims(split: str) -> dict[tuple[str, str], dict[str, str]]:
-    """Return the judgements of a reproduction by claim and measure."""
-    return {(r["claim"], r["kind"]): r for r in lines(f"reproduction/{split}/claims.csv")}
-
-
 def verdicts(text: str) -> str:
     """Return the verdicts on a claim, by the paper's measure and by the fair one."""
     by_text = {(r["text"], kind): r["verdict"] for (_, kind), r in claims("mini").items()}
@@ -323,18 +264,117 @@ def filled(page: str) -> str:
     return re.sub(pattern, table, page)
 
 
+def problems(pages: dict[Path, str]) -> Iterator[str]:
+    """Yield a line for each number of a document that is not that of what is committed.
+
+    Parameters
+    ----------
+    pages
+        The Markdown of README.md and docs/results.md by path.
+    """
+    for path, text in pages.items():
+        if filled(text) != text:
+            yield f"{path.relative_to(ROOT)}: tables are out of date, run docs/figures/tables.py"
+    for name in TABLES:
+        if not any(f"<!-- table: {name} -->\n|" in text for text in pages.values()):
+            yield f"no page has the table {name}"
+    yield from sentences.problems(pages.values())
+    yield from in_output(pages[README])
+    yield from of_suites()
+    yield from of_leaderboard()
+
+
+def printed(*arguments: str) -> str:
+    """Return what a command prints."""
+    with redirect_stdout(io.StringIO()) as output, patch.dict(os.environ, {"COLUMNS": "100"}):
+        code = oodd_eval([*arguments])
+    if code:
+        raise RuntimeError(f"oodd-eval {' '.join(arguments)}: exit code {code}, expected 0")
+    return output.getvalue()
+
+
+def in_output(readme: str) -> Iterator[str]:
+    """Yield a line where the README's main command prints something else of committed records."""
+    command = readme.partition("<!-- command: main -->")[2]
+    detectors = re.search(r"--detector (\S+)", command)[1].split(",")
+    records = [
+        record
+        for entry in entries()
+        for record in entry.records
+        if str(record.setting) in detectors and (record.seed, record.split) == (0, "mini")
+    ]
+    with TemporaryDirectory() as directory:
+        in_order = sorted(records, key=lambda record: detectors.index(record.detector))
+        ResultsDirectory(Path(directory)).merge_records(in_order)
+        text = printed("show", "--stored", directory)
+    if not text.startswith(command.partition("first:\n\n```text\n")[2].partition("```")[0]):
+        yield f"README.md: the main command prints\n{text}"
+
+
+def of_suites() -> Iterator[str]:
+    """Yield a line for each suite's page that its records do not give."""
+    for page in sorted((BOARD / "suites").glob("*/README.md")):
+        name = page.parent.relative_to(ROOT)
+        if printed("show", str(page.parent), "--stored", "--markdown") != read_text(page):
+            yield f"{name}: out of date, run `oodd-eval show {name} --stored --markdown`"
+
+
+def of_leaderboard() -> Iterator[str]:
+    """Yield a line for each line of the board's page, tables and published file that differs.
+
+    Numbers may differ by one in their last printed digit: sums are rounded otherwise on other
+    processors. ``leaderboard build --check`` compares bytes.
+    """
+    files = documents(sections(entries()), suite_sections(BOARD))
+    tables = {path.relative_to(BOARD).as_posix() for path in (BOARD / "tables").glob("*.csv")}
+    for name in sorted(tables - {*files}):
+        yield f"leaderboard/{name} is of no entry"
+    with TemporaryDirectory() as directory:
+        for name, content in files.items():
+            fresh, committed = Path(directory) / Path(name).name, BOARD / name
+            fresh.write_bytes(content if isinstance(content, bytes) else content.encode())
+            texts = read_text(fresh), read_text(committed) if committed.exists() else ""
+            yield from (f"leaderboard/{name}: {line}" for line in unlike(*texts))
+
+
+NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e[+-]?\d+)?(?![\w.])")
+
+
+def digit(text: str) -> float:
+    """Return what one unit of a number's last printed digit is worth; 0 for whole numbers."""
+    if text.lstrip("-").isdigit():
+        return 0.0
+    mantissa, _, exponent = text.partition("e")
+    if len(exponent) > 3:
+        return 0.0  # the beginning of a digest
+    return 10.0 ** (int(exponent or 0) - len(mantissa.partition(".")[2]))
+
+
+def unlike(fresh: str, committed: str) -> Iterator[str]:
+    """Yield a line for each line of two texts that differs by more than rounding."""
+    pairs = zip_longest(fresh.splitlines(), committed.splitlines(), fillvalue="")
+    for i, (new, old) in enumerate(pairs, start=1):
+        if new == old:
+            continue
+        words = [NUMBER.sub("#", re.sub(r" +|-{3,}", " ", text)) for text in (new, old)]
+        numbers = zip(NUMBER.findall(new), NUMBER.findall(old), strict=False)
+        near = all(abs(float(a) - float(b)) <= 1.001 * digit(b) for a, b in numbers)
+        if words[0] != words[1] or not near:
+            yield f"line {i}: {old[:200]!r} is committed, the records give {new[:200]!r}"
+
+
 def main(arguments: list[str]) -> int:
-    """Fill the pages, or with ``--check`` say which would change."""
-    changed = []
-    for path in PAGES:
-        before = path.read_text(encoding="utf-8")
-        if (after := filled(before)) != before:
-            changed.append(str(path.relative_to(ROOT)))
-            if "--check" not in arguments:
-                path.write_text(after, encoding="utf-8")
-    if changed:
-        print("changed:" if "--check" not in arguments else "out of date:", ", ".join(changed))
-    return int(bool(changed) and "--check" in arguments)
+    """Fill the pages, or with ``--check`` print what is wrong in the documents."""
+    pages = {path: path.read_text(encoding="utf-8") for path in PAGES}
+    if arguments == ["--check"]:
+        lines = [*problems(pages)]
+        print("\n".join(lines) or "numbers of the documents are those of what is committed")
+        return int(bool(lines))
+    for path, text in pages.items():
+        if (after := filled(text)) != text:
+            path.write_text(after, encoding="utf-8")
+            print("changed:", path.relative_to(ROOT))
+    return 0
 
 
 if __name__ == "__main__":

@@ -67,15 +67,8 @@ def build(
     """
     on_part("ranking")
     by_board = sections(entries)
-    on_part("page")
-    address = f"{SITE}/{site.PAGE}"
-    files: dict[str, str | bytes] = {PAGE: page(by_board, suites, site=address)}
-    on_part("tables")
-    for section in by_board:
-        files[section.file("ranking")] = ranking_csv(section.ranks, section.trust)
-        files[section.file("comparisons")] = comparisons_csv(section.ranks)
-    on_part("published board")
-    files[PUBLISHED] = published_bytes(by_board, suites)
+    on_part("page and tables")
+    files = documents(by_board, suites)
     files[CELLS] = cells(by_board, suites)
     on_part("site")
     parts = site.files(by_board, suites, project=repository())
@@ -88,6 +81,18 @@ def build(
     for old in set((output / SITE / site.PARTS).glob("*.js")) - {output / name for name in files}:
         old.unlink()
     return list(files)
+
+
+def documents(
+    by_board: Sequence[LeaderboardSection], suites: Sequence[SuiteSection] = ()
+) -> dict[str, str | bytes]:
+    """Return what is committed beside the entries by name: page, tables and the published file."""
+    files: dict[str, str | bytes] = {PAGE: page(by_board, suites, site=f"{SITE}/{site.PAGE}")}
+    for section in by_board:
+        files[section.file("ranking")] = ranking_csv(section.ranks, section.trust)
+        files[section.file("comparisons")] = comparisons_csv(section.ranks)
+    files[PUBLISHED] = published_bytes(by_board, suites)
+    return files
 
 
 def cells(sections: Sequence[LeaderboardSection], suites: Sequence[SuiteSection] = ()) -> bytes:

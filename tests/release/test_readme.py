@@ -8,9 +8,6 @@ from pathlib import Path
 import pytest
 import yaml
 from helpers_docs import parse
-from oodd_leaderboard.entry import read_entries
-
-from oodd_eval.results.directory import ResultsDirectory
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()
@@ -90,24 +87,3 @@ def test_citations_have_the_version():
     assert f"version = {{{__version__}}}" in cite
     assert f"oodd-eval {__version__}, split" in cite
     assert f"oodd_eval-{__version__}-py3-none-any.whl" in (ROOT / "docs" / "index.md").read_text()
-
-
-def test_the_output_of_the_main_command_is_that_of_the_committed_records(
-    tmp_path, capsys, monkeypatch
-):
-    from oodd_eval.cli.main import main
-
-    wanted = re.search(r"--detector (\S+)", commands()["main"])[1].split(",")
-    records = [
-        record
-        for entry in read_entries(ROOT / "leaderboard" / "results")
-        for record in entry.records
-        if str(record.setting) in wanted and (record.seed, record.split) == (0, "mini")
-    ]
-    in_order = sorted(records, key=lambda record: wanted.index(record.detector))
-    ResultsDirectory(tmp_path).merge_records(in_order)
-    monkeypatch.setenv("COLUMNS", "100")
-    assert main(["show", "--stored", str(tmp_path)]) == 0
-    printed = capsys.readouterr().out
-    shown = re.search(r"first:\n\n```text\n(.*?)```", README, re.DOTALL)[1]
-    assert printed[: len(shown)] == shown

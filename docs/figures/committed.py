@@ -1,0 +1,103 @@
+"""What is committed under leaderboard/, for the numbers of README.md and docs/results.md."""
+
+import csv
+import functools
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from oodd_leaderboard.entry import SubmittedEntry, read_entries
+
+from oodd_eval.results.board import Board, boards
+from oodd_eval.results.directory import ResultsDirectory
+from oodd_eval.results.identity import Setting
+
+ROOT = Path(__file__).parents[2]
+BOARD = ROOT / "leaderboard"
+README, RESULTS = ROOT / "README.md", ROOT / "docs" / "results.md"
+
+Row = Callable[[str], str]
+"""Return the cells of a row behind its first one, separated by bars, from what the first names."""
+
+
+def lines(path: str) -> list[dict[str, str]]:
+    """Return the rows of a committed CSV file."""
+    with (BOARD / path).open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+@functools.cache
+def entries() -> list[SubmittedEntry]:
+    """Return the entries of the leaderboard."""
+    return read_entries(BOARD / "results")
+
+
+@functools.cache
+def ranking(split: str) -> dict[str, dict[str, str]]:
+    """Return the primary rows of a board by detector."""
+    (file,) = (BOARD / "tables").glob(f"{split}-*-ranking.csv")
+    rows = lines(str(file.relative_to(BOARD)))
+    return {row["detector"]: row for row in rows if row["primary"] == "true"}
+
+
+@functools.cache
+def board(name: str) -> Board:
+    """Return a suite's board, or that of the entries on mini."""
+    if name == "mini":
+        records = [r for e in entries() for r in e.records if r.split == "mini"]
+    else:
+        records = ResultsDirectory(BOARD / "suites" / name).records()
+    (of_split,) = boards(records)
+    return of_split
+
+
+def mean(
+    name: str,
+    row: str | Setting,
+    metric: str,
+    *,
+    environments: Iterable[str] = (),
+    anomalies: Iterable[str] = (),
+) -> float:
+    """Return a row's mean of a metric in per cent, by default over all cells."""
+    records = board(name)
+    setting = row if isinstance(row, Setting) else Setting(row)
+    over = [*environments] or records.environments, [*anomalies] or records.anomalies
+    return 100 * records.mean(setting, *over, metric).value
+
+
+def cells(values: Iterable[float]) -> str:
+    """Return numbers with one decimal as cells."""
+    return " | ".join(f"{value:.1f}" for value in values)
+
+
+def of_reproductions(table1: str, losses: str) -> Row:
+    """Return AUC by group of a model: of the paper, at Table 1's strengths, at equal losses."""
+
+    def means(split: str) -> dict[tuple[str, str], dict[str, str]]:
+        rows = lines(f"reproduction/{split}/tables/table-5.csv")
+        rows = [r for r in rows if (r["environment"], r["metric"]) == ("mean", "auc")]
+        return {(r["series"], r["anomalies"]): r for r in rows}
+
+    def row(name: str) -> str:
+        ours, same = means(table1), means(losses)
+        keys = [(name, group) for group in ("sensor", "dynamics")]
+        texts = (t for k in keys for t in (same[k]["paper"], ours[k]["value"], same[k]["value"]))
+        return cells(100 * float(text) for text in texts)
+
+    return row
+
+
+def overview(suite: str, name: str) -> list[str]:
+    """Return the cells of a row of detection thresholds on a suite's page."""
+    page = (BOARD / "suites" / suite / "README.md").read_text(encoding="utf-8")
+    table = page.partition("\n### Detection thresholds, lower is better")[2].split("\n\n")[1]
+    rows = [[cell.strip().replace("\\", "") for cell in line.split("|")[1:-1]]
+            for line in table.splitlines()]  # fmt: skip
+    (row,) = (row for row in rows if row[0] == name)
+    return row
+
+
+@functools.cache
+def claims(split: str) -> dict[tuple[str, str], dict[str, str]]:
+    """Return the judgements of a reproduction by claim and measure."""
+    return {(r["claim"], r["kind"]): r for r in lines(f"reproduction/{split}/claims.csv")}

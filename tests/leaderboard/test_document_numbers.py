@@ -1,0 +1,68 @@
+"""The check of the documents' numbers, ``docs/figures/tables.py --check``, and what it sees."""
+
+import re
+import sys
+
+import pytest
+from helpers_docs import ROOT
+
+sys.path.insert(0, str(ROOT / "docs" / "figures"))
+import sentences
+import tables
+
+
+@pytest.mark.artefacts
+def test_numbers_of_the_documents_are_those_of_what_is_committed(capsys):
+    assert tables.main(["--check"]) == 0, capsys.readouterr().out
+
+
+def test_a_wrong_number_in_a_table_is_put_right():
+    page = tables.RESULTS.read_text(encoding="utf-8")
+    ladder = re.search(r"<!-- table: ladder -->\n(\|.*\n)+", page)[0]
+    assert tables.filled(ladder.replace(".", ".9")) == ladder
+
+
+@pytest.fixture
+def one_sentence(monkeypatch):
+    monkeypatch.setattr(sentences, "stated", lambda: ["It is 3 points above `knn`."])
+
+
+@pytest.mark.usefixtures("one_sentence")
+def test_a_sentence_with_another_number_and_a_number_without_a_source_are_seen():
+    table = "<!-- table: board mini -->\n| row | AUC |\n|---|---|\n| `pe` | 96.3 |\n\n"
+    page = f"## Of rows\n\n{table}It has 96.3 %, about 96.\nIt is 3 points above `knn`.\n"
+    assert [*sentences.problems([page])] == []
+    missing, number = sentences.problems([page.replace("is 3 points", "is 4 points")])
+    assert missing.endswith("It is 3 points above `knn`.")
+    assert "It is 4 points above" in number
+    (number,) = sentences.problems([page.replace("It has 96.3", "It has 96.4")])
+    assert number.startswith("Of rows: ")
+    assert "It has 96.4 %" in number
+
+
+def test_another_output_of_the_readmes_command_is_seen(monkeypatch):
+    readme = tables.README.read_text(encoding="utf-8")
+    shown = readme.partition("first:\n\n```text\n")[2].partition("```")[0]
+    monkeypatch.setattr(tables, "entries", list)
+    monkeypatch.setattr(tables, "printed", lambda *_: f"{shown}further tables")
+    assert [*tables.in_output(readme)] == []
+    monkeypatch.setattr(tables, "printed", lambda *_: shown.replace("1", "2", 1))
+    assert len([*tables.in_output(readme)]) == 1
+
+
+@pytest.mark.parametrize(
+    ("fresh", "committed", "same"),
+    [
+        ("a,0.123456", "a,0.123457", True),
+        ("a,0.123456", "a,0.123458", False),
+        ("a,0.123456,1", "a,0.123456,2", False),
+        ("| 85.3 \\[83.0, 87.0] |", "|  85.4 \\[83.0, 87.1] |", True),
+        ("a,1e-07", "a,3e-07", False),
+        ("riqn,1", "npn,1", False),
+        ("a,,1", "a,1,1", False),
+        ("digest 12ab", "digest 13ab", False),
+        ("one\ntwo", "one", False),
+    ],
+)
+def test_rounding_alone_is_no_difference(fresh, committed, same):
+    assert ([*tables.unlike(fresh, committed)] == []) is same
