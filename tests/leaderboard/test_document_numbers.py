@@ -1,4 +1,4 @@
-"""The check of the documents' numbers, ``docs/figures/tables.py --check``, and what it sees."""
+"""What ``docs/figures/tables.py --check`` sees, the check of documents' numbers in ``.ci/run``."""
 
 import re
 import sys
@@ -9,11 +9,6 @@ from helpers_docs import ROOT
 sys.path.insert(0, str(ROOT / "docs" / "figures"))
 import sentences
 import tables
-
-
-@pytest.mark.artefacts
-def test_numbers_of_the_documents_are_those_of_what_is_committed(capsys):
-    assert tables.main(["--check"]) == 0, capsys.readouterr().out
 
 
 def test_a_wrong_number_in_a_table_is_put_right():
