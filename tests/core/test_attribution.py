@@ -291,19 +291,22 @@ def test_a_detector_of_this_process_and_one_that_cannot_be_forked_explain_too(wo
         assert str(record.metrics) == str(iid.metrics)
 
 
-@pytest.mark.parametrize(
-    ("name", "status", "reason"),
-    [
-        ("fails", "error", "RuntimeError: no idea"),
-        ("overstates", "invalid", "explain gives the shares"),
-        ("toomuch", "invalid", "with the score nan: expected both where it is defined"),
-    ],
-)
-def test_a_failing_explanation_is_a_state_with_a_reason(world, name, status, reason):
-    (record,) = evaluate(name, environments="hopper", anomalies="iid")
-    assert record.status == status, record.reason
-    assert reason in record.reason
-    assert not record.metrics
+FAILURES = {
+    "fails": ("error", "RuntimeError: no idea"),
+    "overstates": ("invalid", "explain gives the shares"),
+    "toomuch": ("invalid", "with the score nan: expected both where it is defined"),
+}
+
+
+@pytest.mark.usefixtures("world")
+def test_a_failing_explanation_is_a_state_with_a_reason(tiny_split):
+    records = evaluate([*FAILURES], tiny_split, environments="hopper", anomalies="iid")
+    assert [record.detector for record in records] == [*FAILURES]
+    for record in records:
+        status, reason = FAILURES[record.detector]
+        assert record.status == status, record.reason
+        assert reason in record.reason
+        assert not record.metrics
 
 
 def test_tables_have_a_section_for_detectors_that_explain(world, capsys):

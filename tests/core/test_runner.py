@@ -7,7 +7,7 @@ import textwrap
 from functools import partial
 
 import pytest
-from helpers_plugins import install
+from helpers_plugins import install, local_spec
 from oodd_trivial import Clock
 
 from oodd_eval import evaluate, load_split
@@ -123,19 +123,21 @@ def test_every_way_to_fail_is_a_state_with_a_reason(hostile, name):
 def test_results_do_not_depend_on_the_number_of_jobs(tiny_split, tmp_path):
     settings = {"environments": ("cartpole", "hopper"), "anomalies": ("iid", "gravity")}
     found = [
-        run_tiny(tiny_split, ["clock", "persistence"], tmp_path / str(jobs), jobs=jobs, **settings)
-        for jobs in (1, 4)
+        run_tiny(tiny_split, ["persistence"], tmp_path / str(jobs), jobs=jobs, **settings)
+        for jobs in (1, 2)
     ]
     assert stable(found[0].records) == stable(found[1].records)
-    first, second = (ResultsDirectory(tmp_path / jobs).records() for jobs in "14")
+    first, second = (ResultsDirectory(tmp_path / jobs).records() for jobs in "12")
     assert stable(first) == stable(second) == stable(found[0].records)
 
 
 def test_in_process_and_worker_agree(tiny_split):
-    one = evaluate("persistence", tiny_split, environments="hopper")
-    two = evaluate(discover().offer("persistence").spec.factory, tiny_split, environments="hopper")
+    cells = {"environments": "hopper", "anomalies": "iid,gravity"}
+    one, two = (
+        evaluate(d, tiny_split, **cells) for d in ("persistence", local_spec("persistence"))
+    )
+    assert [r.anomaly for r in one] == [r.anomaly for r in two] == ["iid", "gravity"]
     assert [r.metrics for r in one] == [r.metrics for r in two]
-    assert [r.anomaly for r in one] == [r.anomaly for r in two]
 
 
 def test_evaluate_passes_on_what_a_factory_raises(tiny_split):
@@ -175,7 +177,7 @@ def test_a_second_run_resumes_without_a_fit(tiny_split, tmp_path, counting):
 
 
 def test_another_anomaly_is_scored_and_the_earlier_scores_stay(tiny_split, tmp_path, counting):
-    for anomaly in ("iid", "gravity", "iid", "gravity"):
+    for anomaly in ("iid", "gravity", "iid"):
         run_tiny(tiny_split, ["counting"], tmp_path / "out", anomalies=[anomaly])
     assert len(counting[1]()) == 2
 

@@ -179,6 +179,15 @@ def test_the_mean_ratio_has_the_interval_of_a_plain_joint_bootstrap(two_environm
     )
 
 
+def test_an_interval_ends_at_the_resamples_next_beyond_the_level():
+    logs = np.linspace(-1, 1, 2000)
+    drawn = np.random.default_rng(0).permutation(logs)
+    own = DetectionThreshold(0.1, 9.0, np.append(0.0, drawn))
+    assert own.interval == pytest.approx((math.exp(logs[49]), math.exp(logs[1950])))
+    outside = DetectionThreshold(0.1, 9.0, np.append(2.0, drawn))
+    assert outside.interval[1] == pytest.approx(math.exp(2.0))
+
+
 # The mean over pairs
 
 
