@@ -1,10 +1,8 @@
 """Readers of logs: what files of each format hold comes back, and damage is told with the file."""
 
 import gzip
-import io
 import json
 import struct
-import zipfile
 
 import h5py
 import numpy as np
@@ -94,26 +92,26 @@ def test_a_csv_file_is_read_as_it_is(tmp_path, text, columns):
     assert rows(table("csv", written(tmp_path, text))) == columns
 
 
-@pytest.mark.parametrize("cell", ["", "nan", "NaN", "NA", "N/A", "null", "None", " "])
-def test_what_says_that_nothing_is_there_is_missing(tmp_path, cell):
-    topic = table("csv", written(tmp_path, f"t,x\n0,1\n1,{cell}\n2,3\n"))
-    assert rows(topic)["x"] == pytest.approx([1, np.nan, 3], nan_ok=True)
-
-
 def test_options_say_how_a_csv_file_is_laid_out(tmp_path):
     path = written(tmp_path, "made by a plant\nh°;x\n1;1,5\n", encoding="cp1252")
     with pytest.raises(TrajectoryError, match="UnicodeDecodeError"):
         recordings("csv", path, skip=1)
     topic = table("csv", path, skip=1, encoding="cp1252", separator=";", decimal=",")
     assert rows(topic) == {"h°": [1], "x": [1.5]}
-    assert rows(table("csv", written(tmp_path, "1,2\n3,4\n"), names=["a", "b[bar]"])) == {
-        "a": [1, 3], "b[bar]": [2, 4],
-    }  # fmt: skip
     numbered = written(tmp_path, "1,2\n3,4\n")
+    named = {"a": [1, 3], "b[bar]": [2, 4]}
+    assert rows(table("csv", numbered, names=["a", "b[bar]"])) == named
     assert rows(table("csv", numbered, header=True)) == {"1": [3], "2": [4]}
-    assert rows(table("csv", written(tmp_path, "t\u20ac;x\n1;2", encoding="utf-16"))) == {
-        "t\u20ac": [1], "x": [2],
-    }  # fmt: skip
+    wide = written(tmp_path, "t\u20ac;x\n1;2", encoding="utf-16")
+    assert rows(table("csv", wide)) == {"t\u20ac": [1], "x": [2]}
+    for cell in ("", "nan", "NaN", "NA", "N/A", "null", "None", " "):
+        topic = table("csv", written(tmp_path, f"t,x\n0,1\n1,{cell}\n2,3\n"))
+        assert rows(topic)["x"] == pytest.approx([1, np.nan, 3], nan_ok=True)
+    # A last row may lack its commands.
+    text = "obs:x,action:u,reward\n1,5,0\n2,6,0\n3,,\n"
+    cells = rows(table("csv", written(tmp_path, text)))
+    assert cells["action:u"] == pytest.approx([5, 6, np.nan], nan_ok=True)
+    assert rows(table("csv", written(tmp_path, text.replace("3,,", "3"))))["obs:x"] == [1, 2, 3]
 
 
 @pytest.mark.parametrize(
@@ -176,13 +174,6 @@ def test_a_damaged_file_is_told_with_its_place(tmp_path, name, content, message)
     (tmp_path / name).write_bytes(content)
     with pytest.raises(TrajectoryError, match=message):
         recordings(forms.get(kind, kind), tmp_path / name)
-
-
-def test_a_last_row_may_lack_its_commands(tmp_path):
-    text = "obs:x,action:u,reward\n1,5,0\n2,6,0\n3,,\n"
-    cells = rows(table("csv", written(tmp_path, text)))
-    assert cells["action:u"] == pytest.approx([5, 6, np.nan], nan_ok=True)
-    assert rows(table("csv", written(tmp_path, text.replace("3,,", "3"))))["obs:x"] == [1, 2, 3]
 
 
 def test_the_convention_of_columns_is_taken_however_it_is_spelled(tmp_path):
@@ -337,15 +328,12 @@ def test_a_parquet_file_is_read_in_ranges(tmp_path):
     assert {name: column.tolist() for name, column in head.items()} == {
         "at": [0.001, 0.002], "ok": [0, 1], "mode": ["b", "a"], "pose.frame": ["map", "map"],
     }  # fmt: skip
-
-
-def test_lists_that_grow_are_refused(tmp_path):
-    pq.write_table(pa.table({"x": pa.array([[1.0], [1.0, 2.0]])}), tmp_path / "run.parquet")
-    topic = table("parquet", tmp_path / "run.parquet")
-    assert rows(topic)["x.0"] == [1, 1]  # those that all rows have
-    pq.write_table(pa.table({"x": pa.array([[1.0, 2.0], [1.0]])}), tmp_path / "short.parquet")
+    # Of lists that grow those columns count that all rows have.
+    pq.write_table(pa.table({"x": pa.array([[1.0], [1.0, 2.0]])}), path)
+    assert rows(table("parquet", path))["x.0"] == [1, 1]
+    pq.write_table(pa.table({"x": pa.array([[1.0, 2.0], [1.0]])}), path)
     with pytest.raises(TrajectoryError, match="lists have from 1 to 2 items"):
-        rows(table("parquet", tmp_path / "short.parquet"))
+        rows(table("parquet", path))
 
 
 INFO = {
@@ -456,22 +444,16 @@ def test_a_flat_folder_of_episodes_is_a_lerobot_data_set(tmp_path):
         ("info.json", b"{", "info.json' cannot be read"),
         ("info.json", b'{"features": {}}', "fps is None"),
         ("info.json", b"[" * 100_000, "cannot be read: maximum recursion"),
-        ("episode_000000.parquet", b"PAR1 and nothing", "ArrowInvalid"),
+        ("info.json", json.dumps(INFO | {"data_path": "../{chunk_index}/x.parquet"}).encode(),
+         "outside the data set"),
+        ("data/chunk-000/episode_000000.parquet", b"PAR1 and nothing", "ArrowInvalid"),
     ],
-)
+    ids=lambda value: value if isinstance(value, str) else "content",
+)  # fmt: skip
 def test_a_damaged_lerobot_data_set_is_told(tmp_path, name, content, message):
-    (tmp_path / "info.json").write_text(json.dumps(INFO))
-    (tmp_path / name).write_bytes(content)
-    pq.write_table(lerobot_table([1]), tmp_path / "episode_000001.parquet")
+    (as_version_3 if b"data_path" in content else as_version_2)(tmp_path)
+    (tmp_path / ("meta" if name == "info.json" else "") / name).write_bytes(content)
     with pytest.raises(TrajectoryError, match=message):
-        recordings("lerobot", tmp_path)
-
-
-def test_files_of_episodes_stay_inside_the_data_set(tmp_path):
-    as_version_3(tmp_path)
-    info = INFO | {"data_path": "../{chunk_index}/{file_index}.parquet"}
-    (tmp_path / "meta" / "info.json").write_text(json.dumps(info))
-    with pytest.raises(TrajectoryError, match="outside the data set"):
         recordings("lerobot", tmp_path)
 
 
@@ -512,21 +494,13 @@ def test_arrays_without_observations_are_a_table(tmp_path):
     assert (turned.rows, len(turned.names)) == (2, 5)
 
 
-def test_nothing_in_an_archive_is_unpickled(tmp_path):
-    inner = io.BytesIO()
-    np.lib.format.write_array(inner, np.array([{"a": 1}], dtype=object), allow_pickle=True)
-    with zipfile.ZipFile(tmp_path / "run.npz", "w") as archive:
-        archive.writestr("obs.npy", inner.getvalue())
-    with pytest.raises(TrajectoryError, match="obs has dtype"):
-        recordings("numpy", tmp_path / "run.npz")
-
-
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
         ({"obs": np.zeros((4, 2)), "action": np.zeros((9, 1))}, "action has shape"),
         ({"obs": np.zeros((4, 2, 2))}, "obs has shape"),
         ({"gain": np.array(1.0)}, "expected arrays with a row a step"),
+        ({"obs": np.array([{"a": 1}], dtype=object)}, "obs has dtype"),  # never unpickled
     ],
 )
 def test_arrays_that_form_no_episode_are_told(tmp_path, arrays, message):
@@ -535,7 +509,7 @@ def test_arrays_that_form_no_episode_are_told(tmp_path, arrays, message):
         recordings("numpy", tmp_path / "run.npz")
 
 
-def test_groups_of_an_hdf5_file_are_episodes(tmp_path):
+def test_groups_of_an_hdf5_file_are_episodes_and_a_flat_file_one(tmp_path):
     with h5py.File(tmp_path / "train.h5", "w") as file:
         for i in (2, 10, 1):
             group = file.create_group(f"run-{i}")
@@ -547,6 +521,12 @@ def test_groups_of_an_hdf5_file_are_episodes(tmp_path):
     assert found[1].fields == {"onset": 2, "seed": 7, "parameters": {"mass": 2}, "bed": "B",
                                "terminated": True}  # fmt: skip
     assert rows(found[2].topics[""])["obs:sensor 1"] == [10, 10, 10]
+    with h5py.File(tmp_path / "run.h5", "w") as file:
+        file["t"], file["joints/q"], file["k"] = np.arange(5), np.ones((5, 2)), 2.5
+    (recording,) = recordings("hdf5", tmp_path / "run.h5")
+    assert {*recording.topics[""].names} == {"t", "joints.q.0", "joints.q.1"}
+    assert (recording.name, recording.fields) == ("run", {"k": 2.5})
+    assert recording.topics[""].read(["t"], 2, 4)["t"].tolist() == [2, 3]
 
 
 def test_a_file_of_robomimic_is_its_demonstrations(tmp_path):
@@ -570,40 +550,24 @@ def test_a_file_of_robomimic_is_its_demonstrations(tmp_path):
     assert cells["action:action 1"] == pytest.approx([1, 1, 1, np.nan], nan_ok=True)
 
 
-def test_a_flat_hdf5_file_is_one_recording(tmp_path):
-    with h5py.File(tmp_path / "run.h5", "w") as file:
-        file["t"], file["joints/q"], file["k"] = np.arange(5), np.ones((5, 2)), 2.5
-    (recording,) = recordings("hdf5", tmp_path / "run.h5")
-    assert {*recording.topics[""].names} == {"t", "joints.q.0", "joints.q.1"}
-    assert (recording.name, recording.fields) == ("run", {"k": 2.5})
-    assert recording.topics[""].read(["t"], 2, 4)["t"].tolist() == [2, 3]
-
-
-def linked(path):
-    with h5py.File(path, "w") as file:
-        file["leak"] = h5py.ExternalLink("/etc/passwd", "/")
-
-
-def bomb(path):
-    with h5py.File(path, "w") as file:
-        file.create_dataset("x", (2**40,), "f8", chunks=(2**20,))
-
-
-def truncated(path):
-    with h5py.File(path, "w") as file:
-        file["x"] = np.arange(10_000.0)
-    path.write_bytes(path.read_bytes()[:3000])
-
-
 @pytest.mark.parametrize(
     ("spoil", "message"),
-    [(linked, "points elsewhere"), (bomb, "damaged, or made to fill the memory"),
-     (truncated, "truncated or no HDF5 file")],
+    [
+        (lambda f: f.update(leak=h5py.ExternalLink("/etc/passwd", "/")), "points elsewhere"),
+        (lambda f: f.create_dataset("x", (2**40,), "f8", chunks=(2**20,)),
+         "damaged, or made to fill the memory"),
+        (lambda f: f.update(x=np.arange(10_000.0)), "truncated or no HDF5 file"),
+    ],
+    ids=["link", "bomb", "truncated"],
 )  # fmt: skip
 def test_a_hostile_hdf5_file_is_refused(tmp_path, spoil, message):
-    spoil(tmp_path / "run.h5")
+    path = tmp_path / "run.h5"
+    with h5py.File(path, "w") as file:
+        spoil(file)
+    if message.startswith("truncated"):
+        path.write_bytes(path.read_bytes()[:3000])
     with pytest.raises(TrajectoryError, match=message):
-        recordings("hdf5", tmp_path / "run.h5")
+        recordings("hdf5", path)
 
 
 def test_a_minari_data_set_is_its_episodes(tiny_split, tmp_path):
@@ -626,22 +590,28 @@ def test_a_minari_data_set_is_its_episodes(tiny_split, tmp_path):
 
 
 def test_matrices_of_a_matlab_file_are_columns(tmp_path):
+    path = tmp_path / "run.mat"
     content = {"t": np.arange(6.0)[None], "q": np.arange(12.0).reshape(6, 2), "gain": np.eye(2),
                "rpm": 1797, "note": "a text", "log": {"x": np.arange(3)}}  # fmt: skip
-    scipy.io.savemat(tmp_path / "run.mat", content)
-    (recording,) = recordings("mat", tmp_path / "run.mat")
+    scipy.io.savemat(path, content)
+    (recording,) = recordings("mat", path)
     assert rows(recording.topics[""]) == {
         "t": [0, 1, 2, 3, 4, 5], "q.0": [0, 2, 4, 6, 8, 10], "q.1": [1, 3, 5, 7, 9, 11],
     }  # fmt: skip
     assert recording.fields["rpm"] == 1797
-    assert table("mat", tmp_path / "run.mat", variable="q").names == ("q.0", "q.1")
-    turned = table("mat", tmp_path / "run.mat", variable=["q"], transpose=True)
+    assert table("mat", path, variable="q").names == ("q.0", "q.1")
+    turned = table("mat", path, variable=["q"], transpose=True)
     assert (turned.rows, turned.names[:2]) == (2, ("q.0", "q.1"))
     with pytest.raises(UsageError, match="unknown variable"):
-        recordings("mat", tmp_path / "run.mat", variable="p")
-    scipy.io.savemat(tmp_path / "none.mat", {"log": {"x": np.arange(3)}})
+        recordings("mat", path, variable="p")
+    scipy.io.savemat(path, {"log": {"x": np.arange(3)}})
     with pytest.raises(TrajectoryError, match=r"log \(struct\)"):
-        recordings("mat", tmp_path / "none.mat")
+        recordings("mat", path)
+    scipy.io.savemat(path, {"x": np.arange(1000.0)}, do_compression=True)
+    for size in (200, 60):
+        path.write_bytes(path.read_bytes()[:size])
+        with pytest.raises(TrajectoryError, match=r"run\.mat"):
+            recordings("mat", path)
 
 
 def test_a_matlab_file_of_version_7_3_is_in_matlabs_order(tmp_path):
@@ -652,15 +622,6 @@ def test_a_matlab_file_of_version_7_3_is_in_matlabs_order(tmp_path):
     with path.open("r+b") as file:
         file.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM")
     assert rows(table("mat", path)) == {"t": [0, 1, 2, 3], "x.0": [0, 1, 2, 3], "x.1": [4, 5, 6, 7]}
-
-
-def test_a_truncated_matlab_file_is_told(tmp_path):
-    scipy.io.savemat(tmp_path / "run.mat", {"x": np.arange(1000.0)}, do_compression=True)
-    content = (tmp_path / "run.mat").read_bytes()
-    for size in (200, 60):
-        (tmp_path / "run.mat").write_bytes(content[:size])
-        with pytest.raises(TrajectoryError, match=r"run\.mat"):
-            recordings("mat", tmp_path / "run.mat")
 
 
 # Messages.
@@ -815,12 +776,6 @@ def test_a_bag_of_ros_1_has_topics(tmp_path):
             recordings("rosbag", tmp_path / "run.bag")
 
 
-def test_a_damaged_bag_is_told(tmp_path):
-    (tmp_path / "metadata.yaml").write_text("rosbag2_bagfile_information: [" * 50)
-    with pytest.raises(TrajectoryError):
-        recordings("rosbag", tmp_path)
-
-
 def test_only_names_and_numbers_of_a_definition_become_code():
     words = logs.rosbag._check_words
     words(("a/msg/B", [("X", "int32")], [("x", (1, ("float64", 0)))]))
@@ -890,11 +845,11 @@ def test_what_is_not_there_is_said(tmp_path):
     topic = table("csv", written(tmp_path, "speed,x\n1,2\n"))
     with pytest.raises(UsageError, match=r"run\.csv 'sped': did you mean 'speed'"):
         topic.read(["sped"], 0, 1)
-
-
-def test_a_library_that_is_missing_is_named_with_its_extra(monkeypatch):
     with pytest.raises(MissingExtraError, match=r"need no_such_library: .*oodd-eval\[logs\]"):
         library("no_such_library.part")
+    (tmp_path / "metadata.yaml").write_text("rosbag2_bagfile_information: [" * 50)
+    with pytest.raises(TrajectoryError):
+        recordings("rosbag", tmp_path)
 
 
 READER = """
