@@ -231,11 +231,11 @@ def test_a_dataset_that_minari_collected_is_read(tmp_path, monkeypatch):
             eval_env="CartPole-v1",
         )  # fmt: skip
 
-    def read():
+    def read(name):
         parts = {part: tmp_path / "own" / f"{part}-v0" for part in ("train", "calibration")}
-        return import_data("carts", "cart", form="minari", output=tmp_path / "split", **parts)
+        return import_data(name, "cart", form="minari", output=tmp_path / name, **parts)
 
-    data = read().environment("cart")
+    data = read("carts").environment("cart")
     theirs = minari.load_dataset("own/train-v0")
     for mine, other in zip(data.train, theirs.iterate_episodes(), strict=True):
         assert mine.observations == pytest.approx(other.observations)
@@ -245,7 +245,7 @@ def test_a_dataset_that_minari_collected_is_read(tmp_path, monkeypatch):
     facts = json.loads(file.read_text()) | {"observation_space": '{"type": "Dict"}'}
     file.write_text(json.dumps(facts))
     with pytest.raises(TrajectoryError, match="observations are Dict and actions Discrete"):
-        read()
+        read("again")
 
 
 def rewritten(path, **arrays):

@@ -325,10 +325,10 @@ def test_few_episodes_are_said_to_be_few():
         (logs(n=9), {"window": 1}, "window=1"),
         (logs(n=9), {"sensors": ["a"]}, "1 names of sensors"),
         (logs(n=9), {"baseline": 200}, "no episode of at least"),
-        ([np.zeros(3)], {}, ""),
-        ([np.zeros((5, 2)), np.zeros((5, 3))], {}, ""),
-        ([], {}, ""),
-        (logs(n=1, rows=9), {}, ""),
+        ([np.zeros(3)], {}, "shape (3,)"),
+        ([np.zeros((5, 2)), np.zeros((5, 3))], {}, "[2, 3] sensors"),
+        ([], {}, "[] sensors"),
+        (logs(n=1, rows=9), {}, "a single episode of 9 rows"),
     ],
 )
 def test_wrong_arguments(episodes, arguments, message):
