@@ -108,9 +108,15 @@ def test_a_wrong_name_is_told_with_the_names_there_are(tmp_path, keys, words):
 
 
 def test_columns_in_another_order_are_the_same_and_missing_ones_are_not(tmp_path):
-    folder(tmp_path)
+    folder(tmp_path, d=np.full(10, 3.0))
+    source, parts = read(tmp_path, sensors=["d", "a"])
+    assert len(source.sensors) == 2
+    source, parts = read(tmp_path, sensors=["d", "a"], constant="drop")
+    assert [q.name for q in source.sensors] == ["a"]
+    assert np.array_equal(parts["train"][0].observations[:, 0], table(10, 0)["a"])
+    assert any("d" in line and "constant" in line for line in source.notes)
     rows = table(10, 3)
-    write(tmp_path / "train1.csv", {"b": rows["b"], "c": rows["a"], "a": rows["a"]})
+    write(tmp_path / "train1.csv", {"d": rows["b"], "b": rows["b"], "c": rows["a"], "a": rows["a"]})
     source, parts = read(tmp_path, sensors="*")
     assert np.array_equal(parts["train"][1].observations[:, 0], rows["a"])
     assert source.unused == ("c",)
@@ -137,16 +143,6 @@ def test_discrete_actions_become_one_hot_rows(tmp_path):
     assert [q.name for q in source.actions] == ["left", "stay", "right"]
     assert parts["train"][0].actions.tolist() == [[1, 0, 0], [0, 0, 1], [0, 1, 0]]
     assert "action 1 is 2" in problem(tmp_path, actions="u", discrete=2)
-
-
-def test_constant_sensors_are_kept_or_dropped(tmp_path):
-    folder(tmp_path, c=np.full(10, 3.0))
-    source, parts = read(tmp_path, sensors=["c", "a"])
-    assert len(source.sensors) == 2
-    source, parts = read(tmp_path, sensors=["c", "a"], constant="drop")
-    assert [q.name for q in source.sensors] == ["a"]
-    assert np.array_equal(parts["train"][0].observations[:, 0], table(10, 0)["a"])
-    assert any("c" in line and "constant" in line for line in source.notes)
 
 
 # Stamps
@@ -413,9 +409,7 @@ def test_a_label_that_is_missing_is_that_of_the_row_before(before):
     cells = np.array([np.nan, 1.0, np.nan, 0.0, np.nan])
     expected = [before, True, True, False, False]
     assert anomalous_cells(cells, recipe(), before=before).tolist() == expected
-
-
-def test_intervals_that_touch_or_overlap_are_one():
+    # Intervals that touch or overlap are one.
     rows = [(9, 12, "x"), (5, 9, ""), (20, 30, ""), (22, 24, ""), (40, 41, "")]
     assert merged(rows) == ((5, 12), (20, 30), (40, 41))
     assert merged([(-1, 3, ""), (3, 5, "")]) == ((-1, 5),)
@@ -538,7 +532,7 @@ def test_outcomes_tell_nominal_episodes_from_failures_and_tasks_share_out(tmp_pa
     )
 
 
-def test_a_field_may_name_the_anomaly(tmp_path):
+def test_a_field_may_name_the_anomaly_or_choose_episodes(tmp_path):
     kinds = ["normal", "normal", "Front Collision", "normal", "slip"]
     objects(tmp_path, episodes_of(5, cls=lambda i: kinds[i]))
     source, parts = read(
@@ -549,13 +543,9 @@ def test_a_field_may_name_the_anomaly(tmp_path):
     assert source.groups == {"front-collision": "dynamics", "slip": "sensor"}
     assert [e.intervals for e in parts["test/slip"]] == [((0, 9),)]
     assert sum(len(parts[p]) for p in ("train", "calibration", "test/nominal")) == 3
-
-
-def test_conditions_choose_episodes(tmp_path):
     objects(tmp_path, episodes_of(9, day=lambda i: i % 3))
-    nominal = {"files": "*.jsonl", "where": {"day": [0, "1"]}}
     _, parts = read(
-        tmp_path, sensors="*", nominal=nominal,
+        tmp_path, sensors="*", nominal={"files": "*.jsonl", "where": {"day": [0, "1"]}},
         anomalous={"odd": {"files": "*.jsonl", "where": {"day": 2}}},
     )  # fmt: skip
     assert {len(e.observations) % 3 for e in parts["test/odd"]} == {(5 + 2) % 3}
@@ -569,30 +559,29 @@ def test_parts_follow_one_another_in_natural_order_or_are_shuffled(tmp_path):
     for i in range(1, 13):
         write(tmp_path / f"run_{i}.csv", table(10, i))
     keys = {"nominal": {"files": "run_*.csv", "parts": [0.5, 0.25, 0.25]}}
-    source, parts = read(tmp_path, **keys)
-    names = [e.name for part in ("train", "calibration", "test/nominal") for e in parts[part]]
-    assert names == [f"run_{i}" for i in range(1, 13)]
-    assert [len(parts[p]) for p in parts] == [6, 3, 3]
+
+    def names(**more):
+        source, parts = read(tmp_path, **keys, **more)
+        three = [parts[part] for part in ("train", "calibration", "test/nominal")]
+        return source, [[e.name for e in part] for part in three]
+
+    source, (train, calibration, test) = names()
+    assert train + calibration + test == [f"run_{i}" for i in range(1, 13)]
+    assert (len(train), len(calibration), len(test)) == (6, 3, 3)
     assert "nominal episodes were shared out in the order of files" in source.notes
-    source, parts = read(tmp_path, order="shuffled", seed=1, **keys)
-    mixed = [e.name for part in ("train", "calibration", "test/nominal") for e in parts[part]]
-    assert mixed != names
-    assert sorted(mixed) == sorted(names)
+    source, mixed = names(order="shuffled", seed=1)
+    every = [name for part in mixed for name in part]
+    assert every != train + calibration + test
+    assert sorted(every) == sorted(train + calibration + test)
     assert any("shuffled (seed 1)" in line for line in source.notes)
-    _, again = read(tmp_path, order="shuffled", seed=1, **keys)
-    assert [e.name for e in again["train"]] == [e.name for e in parts["train"]]
-
-
-def test_stamps_order_recordings_where_none_overlap(tmp_path):
-    starts = {"a": 2000, "b": 0, "c": 1000}
-    for name, start in starts.items():
-        write(tmp_path / f"run_{name}.csv", table(10, t=start + np.arange(10)))
-    keys = {"time": "t", "nominal": {"files": "run_*.csv", "parts": [0.34, 0.33, 0.33]}}
-    _, parts = read(tmp_path, **keys)
-    assert [parts[p][0].name for p in parts] == ["run_b", "run_c", "run_a"]
-    write(tmp_path / "run_a.csv", table(10, t=5 + np.arange(10)))
-    _, parts = read(tmp_path, **keys)
-    assert [parts[p][0].name for p in parts] == ["run_a", "run_b", "run_c"]
+    assert names(order="shuffled", seed=1)[1] == mixed
+    # Stamps order recordings where none overlap.
+    keys = {"time": "t", "nominal": {"files": "r_*.csv", "parts": [0.34, 0.33, 0.33]}}
+    for name, start in {"a": 2000, "b": 0, "c": 1000}.items():
+        write(tmp_path / f"r_{name}.csv", table(10, t=start + np.arange(10)))
+    assert names()[1] == [["r_b"], ["r_c"], ["r_a"]]
+    write(tmp_path / "r_a.csv", table(10, t=5 + np.arange(10)))
+    assert names()[1] == [["r_a"], ["r_b"], ["r_c"]]
 
 
 def test_windows_cut_recordings_and_what_is_left_over_is_said(tmp_path):
@@ -603,6 +592,14 @@ def test_windows_cut_recordings_and_what_is_left_over_is_said(tmp_path):
     assert any("20 rows at ends" in line for line in source.notes)
     _, parts = read(tmp_path, window=30)
     assert [len(e.observations) for e in parts["train"]] == [25, 25]
+    # The last window of a fault may be shorter.
+    folder(tmp_path, fault=[0] * 10)
+    write(tmp_path / "odd.csv", table(10, 5, fault=[0] * 8 + [1] * 2))
+    odd = {"odd": {"files": "odd.csv"}}
+    _, parts = read(tmp_path, labels="fault", window=4, anomalous=odd)
+    (episode,) = parts["test/odd"]
+    assert (len(episode.observations), episode.intervals) == (2, ((0, 2),))
+    assert {len(e.observations) for e in parts["train"]} == {4}
 
 
 def test_a_baseline_is_shorter_than_every_episode_and_nominal(tmp_path):
@@ -661,16 +658,6 @@ def test_a_constant_that_moves_later_has_it_too_and_others_keep_their_value(tmp_
     source, parts = read(tmp_path, sensors=["a", "firmware"])
     assert source.offsets == ()
     assert (parts["train"][0].observations[:, 1] == 7).all()
-
-
-def test_the_last_window_of_a_fault_may_be_shorter(tmp_path):
-    folder(tmp_path, fault=[0] * 10)
-    write(tmp_path / "odd.csv", table(10, 5, fault=[0] * 8 + [1] * 2))
-    odd = {"odd": {"files": "odd.csv"}}
-    _, parts = read(tmp_path, labels="fault", window=4, anomalous=odd)
-    (episode,) = parts["test/odd"]
-    assert (len(episode.observations), episode.intervals) == (2, ((0, 2),))
-    assert {len(e.observations) for e in parts["train"]} == {4}
 
 
 def test_ends_of_recordings_known_by_their_outcome_are_left_out_as_nominal_ones_are(tmp_path):
