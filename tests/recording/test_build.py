@@ -50,6 +50,15 @@ def test_two_workers_and_smaller_chunks_give_the_same_bytes(built, tmp_path, mon
     monkeypatch.setattr(build, "CHUNK", {"train": 1, "calibration": 2, "test": 1})
     build_split(SMALL, tmp_path / "again", jobs=2, **FEW)
     assert digest(tmp_path / "again") == digest(built)
+    # The work folder is gone; a complete split is kept, and no other recipe takes its place.
+    assert sorted(p.name for p in built.iterdir()) == ["cartpole.h5", "manifest.json"]
+    before = (built / "cartpole.h5").stat().st_mtime_ns
+    reports = []
+    build_split(SMALL, built, jobs=1, progress=lambda *a: reports.append(a), **FEW)
+    assert reports == []
+    with pytest.raises(UsageError, match="choose another name or remove it"):
+        build_split(dataclasses.replace(SMALL, train=5), built, **FEW)
+    assert (built / "cartpole.h5").stat().st_mtime_ns == before
 
 
 def test_every_x86_processor_with_avx2_records_with_the_same_kernels():
@@ -112,30 +121,16 @@ def test_drawn_bits_decide_all_episodes_and_are_nowhere_in_the_split(tmp_path):
     assert not np.array_equal(first[0], data.train[0].observations[0])
 
 
-def test_episodes_have_seeds_of_their_own_that_numbers_alone_decide():
+def test_seeds_that_are_drawn_need_their_bits(tmp_path):
+    for bits in (None, 1):
+        with pytest.raises(UsageError, match="expected these bits"):
+            build_split(DRAWN, tmp_path / "drawn", bits=bits, **FEW)
+    with pytest.raises(UsageError, match=r"\(none\)"):
+        build_split(SMALL, tmp_path / "small", bits=1, **FEW)
     numbers = [*range(50), *range(300_000, 300_050), *range(600_000, 600_050)]
     assert len({seed_of(number, BITS) for number in numbers}) == len(numbers)
     assert seed_of(7, BITS) == 0xC0BCBF75_1500C421_01149DB8_3C32A991
     assert seed_of(950_600_001, None) == 950_600_001
-
-
-@pytest.mark.parametrize("bits", [None, 1])
-def test_seeds_that_are_drawn_need_their_bits(tmp_path, bits):
-    with pytest.raises(UsageError, match="expected these bits"):
-        build_split(DRAWN, tmp_path / "drawn", bits=bits, **FEW)
-    with pytest.raises(UsageError, match=r"\(none\)"):
-        build_split(SMALL, tmp_path / "small", bits=1, **FEW)
-
-
-def test_the_work_folder_goes_away_and_a_complete_split_is_kept(built):
-    assert sorted(p.name for p in built.iterdir()) == [
-        "cartpole.h5", "manifest.json"
-    ]  # fmt: skip
-    before = (built / "cartpole.h5").stat().st_mtime_ns
-    reports = []
-    build_split(SMALL, built, jobs=1, progress=lambda *a: reports.append(a), **FEW)
-    assert reports == []
-    assert (built / "cartpole.h5").stat().st_mtime_ns == before
 
 
 def test_a_damaged_file_is_built_again_and_what_others_keep_there_stays(built, tmp_path):
@@ -210,11 +205,6 @@ def test_a_policy_that_never_lasts_is_an_error(in_process, tmp_path):
         build_split(
             SMALL, tmp_path / "small", policies={"cartpole": tmp_path / "cartpole.npz"}, **FEW
         )
-
-
-def test_another_recipe_does_not_overwrite(built):
-    with pytest.raises(UsageError, match="choose another name or remove it"):
-        build_split(dataclasses.replace(SMALL, train=5), built, **FEW)
 
 
 def test_wrong_requests_fail_before_any_work(tmp_path):

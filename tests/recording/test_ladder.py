@@ -254,15 +254,6 @@ def test_a_ladder_has_its_bases_episodes_and_one_part_a_rung(
     assert (tmp_path / "up" / "cartpole.h5").stat().st_mtime_ns == before
 
 
-def test_noise_is_part_of_the_recipe_and_of_every_episode(base, in_process, tmp_path):
-    recipe = SplitDefinition("loud", 3, 2, 2, 60, 951, noise=0.05)
-    loud = load_split(build_split(recipe, tmp_path / "loud", **FEW))
-    assert loud.manifest["definition"]["noise"] == 0.05
-    assert "noise" not in load_split(base).manifest["definition"]
-    noisy, clean = (s.environment("cartpole").train for s in (loud, load_split(base)))
-    assert noisy[0].observations[0].tolist() != clean[0].observations[0].tolist()
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -281,16 +272,22 @@ def test_wrong_recipes_are_refused(options, message, capsys, tmp_path, monkeypat
     assert not list(tmp_path.iterdir())
 
 
-def test_a_split_of_ones_own_gets_a_ladder(base, own_ladder, in_process, tmp_path, capsys):
-    code = main(["data", "build", "mine", "--base", str(base), "--suite", "ladder", "--env",
-                 "cartpole", "--output", str(tmp_path / "mine")])  # fmt: skip
-    assert code == 0
-    assert load_split(tmp_path / "mine").conditions("cartpole")[0] == Condition("iid", "4th")
+def test_a_split_of_ones_own_gets_a_ladder(base, own_ladder, in_process, tmp_path):
+    place, output = str(tmp_path / "mine"), str(tmp_path / "out")
+    assert main(["data", "build", "mine", "--base", str(base), "--suite", "ladder", "--env",
+                 "cartpole", "--output", place]) == 0  # fmt: skip
+    assert load_split(place).conditions("cartpole")[0] == Condition("iid", "4th")
     assert main(["run", "--detector", "clock", "--env", "cartpole", "--anomaly", "iid", "--split",
-                 str(tmp_path / "mine"), "--output", str(tmp_path / "out")]) == 0  # fmt: skip
+                 place, "--output", output]) == 0  # fmt: skip
     lines = (tmp_path / "out" / "records.jsonl").read_text().splitlines()
     assert [(json.loads(x)["anomaly"], json.loads(x)["strength"]) for x in lines] == [
         ("iid", "4th"), ("iid", "kept99"),
     ]  # fmt: skip
-    capsys.readouterr()
-    assert main(["show", str(tmp_path / "out"), "--split", str(tmp_path / "mine")]) == 0
+    assert main(["show", output, "--split", place]) == 0
+    # Noise is part of the recipe and of every episode.
+    recipe = SplitDefinition("loud", 3, 2, 2, 60, 951, noise=0.05)
+    loud = load_split(build_split(recipe, tmp_path / "loud", **FEW))
+    assert loud.manifest["definition"]["noise"] == 0.05
+    assert "noise" not in load_split(base).manifest["definition"]
+    noisy, clean = (s.environment("cartpole").train for s in (loud, load_split(base)))
+    assert noisy[0].observations[0].tolist() != clean[0].observations[0].tolist()
