@@ -50,6 +50,11 @@ def test_a_clean_folder_has_no_remark_but_its_rate(clean):
     assert logs.times == {"t": "s"}
     assert 'time = "t", rate = 100' in topics(logs)["time"]
     assert [*looks_like(logs).values()] == ["time (seconds)", "", ""]
+    # A file of intervals is no recording.
+    write(clean / "labels.csv", {"file": ["run-1.csv"], "start": [30], "stop": [40]})
+    logs = inspect_logs(clean)
+    assert logs.intervals == draft_recipe(clean).intervals == "labels.csv"
+    assert len(logs.recordings) == 40
 
 
 def with_columns(clean, rows=60, **columns):
@@ -210,9 +215,11 @@ def test_labels_by_rows_sort_the_files(tmp_path, separator):
     assert (recipe.time, recipe.rate) == ("t", 100)
 
 
-def test_text_labels_name_their_nominal_value(tmp_path):
-    state = ["fine"] * 150 + ["broken"] * 50
-    write(tmp_path / "a.csv", process(200) | {"health": state})
+def test_labels_are_often_nominal_and_texts_name_their_nominal_value(tmp_path):
+    for zeros, label in ((30, True), (10, False)):
+        write(tmp_path / "a.csv", process(60) | {"fail_flags": (np.arange(60) >= zeros) * 8})
+        assert bool(inspect_logs(tmp_path).labels) == label
+    write(tmp_path / "a.csv", process(200) | {"health": ["fine"] * 150 + ["broken"] * 50})
     recipe = draft_recipe(tmp_path)
     assert recipe.labels == ("health",)
     assert recipe.nominal_label == ("fine",)
@@ -220,13 +227,21 @@ def test_text_labels_name_their_nominal_value(tmp_path):
     assert recipe.nominal.files == recipe.anomalous["fault"].files == ("a.csv",)
 
 
-def test_folders_sort_files_where_no_label_does(tmp_path):
-    for i in range(3):
-        write(tmp_path / "nominal" / f"run-{i}.csv", times(50) | process(50, i))
-        write(tmp_path / "Slip 1" / f"run-{i}.csv", times(50) | process(50, 9 + i))
+@pytest.mark.parametrize(
+    ("names", "nominal", "kind", "anomalous"),
+    [
+        (["nominal/run-0", "nominal/run-1", "Slip 1/run-0"], "nominal/*.csv", "slip-1",
+         "Slip 1/run-0.csv"),
+        (["flight_1_no_failure", "flight_2_engine_failure", "flight_3_no_failure"],
+         "flight*no_failure.csv", "engine", "flight_2_engine_failure.csv"),
+    ],
+)  # fmt: skip
+def test_names_of_folders_and_files_sort_them(tmp_path, names, nominal, kind, anomalous):
+    for i, name in enumerate(names):
+        write(tmp_path / f"{name}.csv", times(50) | process(50, i))
     recipe = draft_recipe(tmp_path)
-    assert recipe.nominal.files == ("nominal/*.csv",)
-    assert recipe.anomalous["slip-1"].files == ("Slip 1/*.csv",)
+    assert recipe.nominal.files == (nominal,)
+    assert recipe.anomalous[kind].files == (anomalous,)
 
 
 @pytest.mark.parametrize("labelled", [False, True])
@@ -244,14 +259,6 @@ def test_a_first_recipe_cuts_faulty_files_only_where_labels_say_since_when(tmp_p
     assert (recipe.window, recipe.clock) == ((60, False) if labelled else (0, True))
     assert ("# window = 60 " in text) == (not labelled)
     assert ("once labels" in topics(logs)["few"]) == (not labelled)
-
-
-def test_names_of_files_sort_them(tmp_path):
-    for i, name in enumerate(["1_no_failure", "2_engine_failure", "3_no_failure"]):
-        write(tmp_path / f"flight_{name}.csv", times(50) | process(50, i))
-    recipe = draft_recipe(tmp_path)
-    assert recipe.nominal.files == ("flight*no_failure.csv",)
-    assert recipe.anomalous["engine"].files == ("flight_2_engine_failure.csv",)
 
 
 def test_a_transposed_matrix_is_noticed_by_its_neighbours_and_read_as_it_is_meant(tmp_path):
@@ -285,12 +292,6 @@ def test_equal_files_are_named_and_those_without_a_column_in_common_left_out(tmp
     recipe = draft_recipe(tmp_path)
     assert recipe.nominal.files == ("a.csv", "b.csv")
     assert recipe.sensors == ("q[rad]", "tau[N m]")
-
-
-@pytest.mark.parametrize(("zeros", "label"), [(30, True), (10, False)])
-def test_a_label_is_often_nominal(tmp_path, zeros, label):
-    write(tmp_path / "a.csv", process(60) | {"fail_flags": (np.arange(60) >= zeros) * 8})
-    assert bool(inspect_logs(tmp_path).labels) == label
 
 
 def test_blocks_with_classes_are_sorted_by_kind(tmp_path):
@@ -334,14 +335,6 @@ def test_a_recording_that_ends_as_another_begins_is_named(tmp_path):
     logs = inspect_logs(tmp_path)
     assert logs.continued == [("free.csv", "odd.csv", 60)]
     assert "60 rows of free.csv" in topics(logs)["continued"]
-
-
-def test_a_file_of_intervals_is_no_recording(clean):
-    write(clean / "labels.csv", {"file": ["run-1.csv"], "start": [30], "stop": [40]})
-    logs = inspect_logs(clean)
-    assert logs.intervals == "labels.csv"
-    assert len(logs.recordings) == 40
-    assert draft_recipe(clean).intervals == "labels.csv"
 
 
 def test_a_file_that_cannot_be_read_is_reported_beside_the_others(clean):
