@@ -487,24 +487,7 @@ def _header(header):
     return prepare
 
 
-METADATA = "minari/oodd/small/cartpole/train-v0/data/metadata.json"
-
-
-def _metadata(change):
-    def prepare(place):
-        facts = json.loads((place / METADATA).read_text())
-        for key in ("observation_space", "action_space"):
-            facts[key] = json.loads(facts[key])
-        change(facts)
-        for key in ("observation_space", "action_space"):
-            facts[key] = facts[key] if isinstance(facts[key], str) else json.dumps(facts[key])
-        (place / METADATA).write_text(json.dumps(facts))
-
-    return prepare
-
-
 RECIPE = ("data", "import", "logs/recipe.toml", "--output", "imported")
-INSPECT = ("data", "inspect", "minari/oodd/small/cartpole/train-v0")
 MINARI = ("data", "import", "minari.toml", "--output", "imported")
 RUN = ("run", "--config", "config.toml", "--output", "out")
 PARAMETER = (
@@ -540,10 +523,10 @@ ONSETS = (
 )  # fmt: skip
 
 
-def _cases(family, arguments, make, table, *, refused=True):
+def _cases(family, arguments, make, table):
     """Cases of one command: of each name what a function makes of the table's value."""
     return [
-        Case(f"{family}: {name}", make(value), arguments, refused=refused)
+        Case(f"{family}: {name}", make(value), arguments, refused=True)
         for name, value in table.items()
     ]
 
@@ -553,7 +536,12 @@ def _recipe(edit):
 
 
 def _actions(space):
-    return _metadata(lambda facts: facts.update(action_space=space))
+    def prepare(place):
+        path = place / "minari/oodd/small/cartpole/train-v0/data/metadata.json"
+        text = space if isinstance(space, str) else json.dumps(space)
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"action_space": text}))
+
+    return prepare
 
 
 SPACES = {
@@ -561,7 +549,7 @@ SPACES = {
     "many actions": {"type": "Discrete", "n": 10**12},
     "negative": {"type": "Discrete", "n": -1},
     "start": {"type": "Discrete", "n": 2, "start": 10**400},
-    "action's type": {"type": {"a": 1}},
+    "no text as type": {"type": {"a": 1}},
 }
 LONG, LONGER = "9" * 4200, "9" * 5000
 """Digits that Python reads as a number, and more than it reads."""
@@ -597,32 +585,14 @@ IMPORTS = [
         "huge shape": b"{'descr': '<f8', 'fortran_order': False, 'shape': (10**18,)}",
         "negative shape": b"{'descr': '<f8', 'fortran_order': False, 'shape': (-3,)}",
     }),
-    *_cases("Minari inspected", INSPECT, _actions, SPACES, refused=False),
     *_cases("Minari imported", MINARI, _actions, SPACES),
-    *_cases("Minari metadata", INSPECT, _metadata, {
-        "type is a list": lambda f: f["observation_space"].update(type=["Box"]),
-        "space is a list": lambda f: f.update(observation_space=[]),
-        "sensors": lambda f: f.update(sensors=7),
-        "names": lambda f: f.update(sensors=[{"name": ["a"], "unit": None}]),
-        "deep": lambda f: f.update(observation_space="[" * 10**5),
-    }, refused=False),
     *_cases("recipe", RECIPE, _recipe, {
         "in two parts": (r'"calibration/\*.csv"', '"calibration/*.csv", "train/run-0.csv"'),
         "onset with digits": (r"onset = 20", f"onset = {LONG}"),
         "onset text": (r"onset = 20", "onset = '1_0'"),
-        "long digits": (r"onset = 20", f"onset = {LONGER}"),
-        "deep": (r"onset = 20", "onset = " + "[" * 4000),
-        "deep table": (r"onset = 20", "onset" + ".a" * 4000 + " = 1"),
-        "steering key": (r"onset = 20", '"\\u001b[2J" = 1'),
         "long name": (r"pump", "p" * 5000),
         "window": (r"onset = 20", f"window = {LONG}"),
     }),
-    *_cases("table", RECIPE, lambda rows: _text("logs/train/run-0.csv", rows), {
-        "long row": "time,a[bar],b\n0,1,2\n0.1,2,3\n0.2,1,3,4,5\n",
-        "long digits": f"time,a[bar],b\n0,1,2\n0.1,2,{LONGER}\n",
-        "other digits": "time,a[bar],b\n0,1,2\n0.1,2,\u0663\n",
-        "quote": 'time,a[bar],b\n"0,1,2\n',
-    }, refused=False),
     *(
         Case(f"discrete: {name}", lambda _: None, (*PAIRED, "--discrete", number), refused=True)
         for name, number in {"huge": str(10**9), "long": LONGER, "other": "\u0663"}.items()
@@ -632,9 +602,6 @@ IMPORTS = [
 
 CONFIGURATIONS = [
     *_cases("configuration", RUN, lambda text: _text("config.toml", text), {
-        "deep": "detector = " + "[" * 5000,
-        "deep table": "a" + ".a" * 5000 + " = 1",
-        "long digits": f"seed = {LONGER}",
         "long seeds": f"seed = [{LONG}]",
         "long horizon": f"horizon = [1, {LONG}]",
         "steering key": f"{json.dumps(STEERING)} = 1",

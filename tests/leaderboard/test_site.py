@@ -39,11 +39,6 @@ def page_of(entries):
 
 
 @pytest.fixture(scope="module")
-def entries(tmp_path_factory):
-    return helpers_site.example(tmp_path_factory.mktemp("results"))
-
-
-@pytest.fixture(scope="module")
 def files(entries):
     return site.files(sections(entries))
 

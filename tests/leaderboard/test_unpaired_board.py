@@ -3,7 +3,6 @@
 import json
 import time
 
-import helpers_browser
 import helpers_logs
 import helpers_site
 import numpy as np
@@ -376,14 +375,6 @@ def address(entries, tmp_path_factory):
     others = helpers_site.example(tmp_path_factory.mktemp("benchmark"))
     everything = sections([*read_entries(entries), *others])
     return helpers_site.write_site(directory, site.files(everything))
-
-
-@pytest.fixture(scope="module")
-def window(tmp_path_factory):
-    if helpers_browser.programs() is None:
-        pytest.skip("no chromium with chromedriver on this machine (Debian: chromium-driver)")
-    with helpers_browser.launch(tmp_path_factory.mktemp("browser")) as window:
-        yield window
 
 
 VIEWS = ("ranking", "guaranteed", "environments", "anomalies", "rows", "cost")
