@@ -26,7 +26,7 @@ from oodd_eval.errors import PromiseWarning
 from oodd_eval.results.board import boards
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.render.text import markdown_table
-from oodd_eval.results.unpaired import UnpairedTables
+from oodd_eval.results.tables import of_logs
 from oodd_eval.scoring.promises import promises_of
 
 ROOT = Path(__file__).parents[1]
@@ -110,11 +110,10 @@ def tables_of(records):
     pages = {}
     for board in boards(records):
         (environment,) = board.environments
-        tables = UnpairedTables(board)
         texts = [
             re.sub(r"^### (.*)", r"**\1**", markdown_table(table)).strip()
-            for table in (tables.headline(), tables.outcomes(), tables.nominal())
-            if table
+            for table in of_logs(board)
+            if " by " not in table.title and "Metrics of rows" not in table.title
         ]
         pages[sets[environment]] = "\n\n".join(texts)
     return pages

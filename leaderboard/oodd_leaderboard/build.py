@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from oodd_eval._version import repository
 from oodd_eval.data.facts import SPLITS, title_of
@@ -23,7 +23,6 @@ from oodd_eval.results.render.text import escape, markdown_body, markdown_list, 
 from oodd_eval.results.report import Section, findings_of
 from oodd_eval.results.standings import RankedBoard, primary_settings, verdict_of
 from oodd_eval.results.tables import Table
-from oodd_eval.results.unpaired import UnpairedTables
 from oodd_leaderboard import site
 from oodd_leaderboard.entry import (
     SUITES,
@@ -189,16 +188,15 @@ def _section(section: LeaderboardSection) -> str:
     files = ", ".join(f"[{kind}]({section.file(kind)})" for kind in kinds)
     cells = f"{len(board.records)}, of which {ok} ok and {len(board.records) - ok} failed"
     size = f"Digest {escape(board.digest)}. Rows: {len(ranks.standings)}. Cells: {cells}."
-    of_scores: Sequence[Table | None] = [
-        tables.separability(board),
-        tables.guaranteed(board, intervals=True, standings=ranks.standings),
-    ]
-    if not board.paired:
-        unpaired = UnpairedTables(board, intervals=True, standings=ranks.standings)
-        of_scores = unpaired.overview(whole=True)
+    settings: dict[str, Any] = {"intervals": True, "standings": ranks.standings}
+    of_scores: Sequence[Table | None] = (
+        [tables.separability(board), tables.guaranteed(board, **settings)]
+        if board.paired
+        else tables.of_logs(board, whole=True, **settings)
+    )
     body_tables = [
         *of_scores,
-        tables.attribution(board, intervals=True, standings=ranks.standings),
+        tables.attribution(board, **settings),
         tables.cost(ranks),
         tables.all_metrics(board),
         *tables.all_alarms(board),

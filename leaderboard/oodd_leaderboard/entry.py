@@ -39,7 +39,6 @@ from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
 from oodd_eval.results.standings import RankedBoard, primary_settings, ranked
 from oodd_eval.results.tables import Table
-from oodd_eval.results.unpaired import UnpairedTables
 
 _T = TypeVar("_T")
 
@@ -349,8 +348,7 @@ def suite_sections(directory: Path) -> list[SuiteSection]:
         for board in boards(ResultsDirectory(path).records()):
             graded = strengths.strength_tables(board) if board.paired else []
             suite_tables = graded or [tables.separability(board)]
-            if not board.paired:
-                suite_tables = UnpairedTables(board).overview()
+            suite_tables = suite_tables if board.paired else tables.of_logs(board)
             suites.append(SuiteSection(path.name, board, suite_tables, graded=bool(graded)))
     return suites
 

@@ -18,7 +18,15 @@ from oodd_eval.errors import ResultsError, UsageError
 from oodd_eval.metrics.catalogue import FOUND_WITHIN, UNDEFINED, metric_info
 from oodd_eval.metrics.ranking import PairTest, Ranking
 from oodd_eval.names import counted
-from oodd_eval.results.board import Conditions, boards, expected_cells, grouped, level_of, ranked_by
+from oodd_eval.results.board import (
+    Column,
+    Conditions,
+    boards,
+    expected_cells,
+    grouped,
+    level_of,
+    ranked_by,
+)
 from oodd_eval.results.directory import read_records
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import NAN, Metric, Record, same_terms
@@ -30,7 +38,7 @@ from oodd_eval.results.standings import (
     primary_settings,
     ranked,
 )
-from oodd_eval.results.tables import Mean, Table, texts
+from oodd_eval.results.tables import Table, texts
 from oodd_leaderboard.entry import LeaderboardSection, SuiteSection
 
 PUBLISHED: Final = "published.jsonl.xz"
@@ -314,7 +322,6 @@ def rankings(
 
     Trust is by row; a row without is of no entry. Letters of tie groups stand behind a rank.
     """
-    over = ranks.board.environments, ranks.board.anomalies
     by_scores, by_alarms = (
         metric_info(n) for n in (ranks.board.ranking, ranks.board.alarm_ranking)
     )
@@ -322,7 +329,7 @@ def rankings(
     def rows(
         standings: Iterable[Standing], ranking: Ranking, *metrics: str
     ) -> list[tuple[Setting, list[str]]]:
-        columns = [Mean(name, name, *over, name == metrics[0]) for name in metrics]
+        columns = [Column(name, intervals=name == metrics[0]) for name in metrics]
         lines = []
         for row in standings:
             label = str(row.entry)

@@ -34,7 +34,7 @@ from oodd_eval.results.record import Record
 from oodd_eval.results.render import FORMATS, Format
 from oodd_eval.results.render.text import print_sections
 from oodd_eval.results.report import Report
-from oodd_eval.results.unpaired import ROWS
+from oodd_eval.results.tables import ROWS
 
 _format_options: Final = together(
     *(

@@ -65,6 +65,16 @@ class Value(NamedTuple):
     brief: bool = False
 
 
+class Column(NamedTuple):
+    """A column of a table: the mean of a metric over some cells of a board, by default over all."""
+
+    metric: str
+    title: str = ""
+    environments: Sequence[str] = ()
+    anomalies: Sequence[str] = ()
+    intervals: bool = False
+
+
 class Board:
     """Records of one split digest, protocol and limit, with twins or without, see `boards`.
 
@@ -160,6 +170,11 @@ class Board:
         `expected_cells`, count only where none of the others is.
         """
         return self._mean(entry, tuple(environments), tuple(anomalies), metric, intervals)
+
+    def of(self, entry: Setting, column: Column) -> Value:
+        """Return an entry's value in a column."""
+        over = column.environments or self.environments, column.anomalies or self.anomalies
+        return self.mean(entry, *over, column.metric, intervals=column.intervals)
 
     def _computed(
         self,

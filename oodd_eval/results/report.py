@@ -17,7 +17,6 @@ from oodd_eval.results.record import Record
 from oodd_eval.results.standings import verdict_of
 from oodd_eval.results.strengths import thresholds
 from oodd_eval.results.tables import Table
-from oodd_eval.results.unpaired import UnpairedTables, phase_findings
 
 Detail = Literal["brief", "wide", "full"]
 
@@ -130,8 +129,8 @@ class Report:
                 yield tables.separability(board, intervals=intervals)
             yield tables.guaranteed(board, self.level, intervals=intervals)
         else:
-            of_board = UnpairedTables(board, intervals, level=self.level)
-            yield from of_board.overview(whole=self.detail != "brief")
+            whole = self.detail != "brief"
+            yield from tables.of_logs(board, intervals=intervals, level=self.level, whole=whole)
         yield tables.attribution(board, intervals=intervals)
         yield from strengths.strength_tables(
             board, intervals=intervals, places=full, units=self.units
@@ -190,7 +189,7 @@ def findings_of(board: Board, level: str = "") -> list[str]:
     return [
         *tables.withheld(board),
         *tables.findings(board),
-        *phase_findings(board),
+        *tables.phase_findings(board),
         *(tables.missing_level(board, level or HEADLINE) if bare else ()),
     ]
 

@@ -4,20 +4,21 @@ import itertools
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final, NamedTuple
+from typing import Final
 
 from oodd_eval.data.condition import NOMINAL
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, TABLE1, title_of
 from oodd_eval.metrics import catalogue
+from oodd_eval.metrics.alarms import missing_level as _too_few
+from oodd_eval.metrics.alarms import offered_levels
 from oodd_eval.metrics.bootstrap import nan_mean
 from oodd_eval.metrics.catalogue import PAPER, UNDEFINED, metric_info
 from oodd_eval.names import counted
 from oodd_eval.plugins.contract import training_mark
-from oodd_eval.results.board import Board, Value, grouped
+from oodd_eval.results.board import Board, Column, Value, cells_with, grouped
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
 from oodd_eval.results.standings import RankedBoard, Standing
-from oodd_eval.results.undefined import why_undefined
 
 BRIEF: Final = "\N{DAGGER}"
 """Marks the figures of brief cells."""
@@ -76,48 +77,36 @@ def show_value(value: Value, metric: str) -> str:
     return text + "*" * value.partial + BRIEF * value.brief
 
 
-class Mean(NamedTuple):
-    """A column: the mean of a metric over some of a board's cells."""
-
-    title: str
-    metric: str
-    environments: Sequence[str]
-    anomalies: Sequence[str]
-    intervals: bool = False
-
-
-def texts(board: Board, entry: Setting, columns: Iterable[Mean]) -> list[str]:
+def texts(board: Board, entry: Setting, columns: Iterable[Column]) -> list[str]:
     """Return a row's means as printed, one a column."""
-    return [
-        show_value(board.mean(entry, environments, anomalies, metric, intervals=intervals), metric)
-        for _, metric, environments, anomalies, intervals in columns
-    ]
+    return [show_value(board.of(entry, column), column.metric) for column in columns]
 
 
-def reasons(board: Board, entries: Iterable[Setting], columns: Iterable[Mean]) -> list[str]:
+def reasons(board: Board, entries: Iterable[Setting], columns: Iterable[Column]) -> list[str]:
     """Return why rows have no figure in columns, a sentence for each reason."""
     rows = grouped(board.records, lambda r: r.setting)
-    lacking: dict[str, dict[str, dict[str, None]]] = {}  # columns and rows by reason
-    over = [(c, {*itertools.product(c.environments, c.anomalies)}) for c in columns]
-    for entry, (column, cells) in itertools.product(entries, over):
-        mean = board.mean(entry, column.environments, column.anomalies, column.metric)
+    lacking: dict[str, tuple[dict[str, None], dict[str, None]]] = {}  # rows and columns by reason
+    for entry, column in itertools.product(entries, list(columns)):
+        mean = board.of(entry, column._replace(intervals=False))
         if mean.state or not math.isnan(mean.value):
             continue
-        of_cells = (r for r in rows[entry] if (r.environment, r.anomaly) in cells)
-        for reason in dict.fromkeys(why_undefined(r, column.metric) for r in of_cells):
-            of_reason = lacking.setdefault(reason, {"columns": {}, "rows": {}})
-            of_reason["columns"][column.title] = of_reason["rows"][str(entry)] = None
+        for r in rows[entry]:
+            if column.environments and r.environment not in column.environments:
+                continue
+            if column.anomalies and r.anomaly not in column.anomalies:
+                continue
+            of_reason = lacking.setdefault(why_undefined(r, column.metric), ({}, {}))
+            of_reason[0][str(entry)] = of_reason[1][column.title] = None
     return [
-        f"Undefined for {_listed(of, 'rows')}: {_listed(of, 'columns')} ({reason})."
-        for reason, of in lacking.items()
+        f"Undefined for {_listed(rows, 'rows')}: {_listed(columns, 'columns')} ({reason})."
+        for reason, (rows, columns) in lacking.items()
         if reason
     ]
 
 
-def _listed(names: Mapping[str, Collection[str]], kind: str) -> str:
-    """Return the names of a kind one after the other, or how many they are."""
-    chosen = names[kind]
-    return ", ".join(chosen) if len(chosen) <= _NAMED else f"{len(chosen)} {kind}"
+def _listed(names: Collection[str], kind: str) -> str:
+    """Return names one after the other, or how many they are."""
+    return ", ".join(names) if len(names) <= _NAMED else f"{len(names)} {kind}"
 
 
 _NAMED: Final = 8  # names in a sentence, beyond which it has their number
@@ -125,51 +114,45 @@ _NAMED: Final = 8  # names in a sentence, beyond which it has their number
 BLIND: Final = ("clock", "comb")  # know the time alone: their AUC says nothing of dynamics
 
 _SIMPLE: Final = (
-    "random",
-    "persistence",
-    *BLIND,
-    "range",
-    "mahalanobis",
-    "manifold",
-    "rf",
-    "rf-ewma",
+    *("random", "persistence", *BLIND, "range", "mahalanobis", "manifold", "rf", "rf-ewma"),
 )
 """Rows that a detector with a learned model of the dynamics should beat."""
 
 _FEW: Final = 30  # test seeds per environment below which a board calls comparisons weak
 
+CLOCK: Final = "clock"  # the row that knows the phase of an episode and nothing else
+
+_WITHIN: Final = tuple(f"found_within_{k}" for k in catalogue.FOUND_WITHIN)
 _ALARMS: Final = (
-    "delay_censored",
-    "missed",
-    *(f"found_within_{k}" for k in catalogue.FOUND_WITHIN),
-    f"found_within_{catalogue.FOUND_WITHIN[-1]}_null",
-    "false_episodes",
-    "early",
+    *("delay_censored", "missed", *_WITHIN, f"{_WITHIN[-1]}_null", "false_episodes", "early"),
 )
 """Columns of a table of guaranteed alarms. The null of the longest span is the largest."""
 
 _PAPER: Final = ("delay", "delay_null", "delay_censored", "missed", "far", "far_twin")
-"""Columns of the paper's alarm."""
-
 _PAPERS_NULLS: Final = ("delay_null", "far_twin")
+
+POOLED: Final = ("auc_pool", "auc_pool_null", "auc_rows")
+"""Metrics of rows that are known to be anomalous, in the order of the headline's columns."""
+
+_ALARMS_OF_LOGS: Final = (
+    *("events_found", "delay_censored", _WITHIN[-1], "missed"),
+    *("false_episodes", "early", "false_alarms_per_hour"),
+)
+
+ROWS: Final = tuple(name for name, info in catalogue.METRICS.items() if info.request)
+"""Metrics of published tables, which rank nothing."""
 
 _LABELS: Final = ("rank", "detector", "settings")
 
 
-def _by_group(board: Board, title: str, *, intervals: bool) -> list[Mean]:
-    """Return the metric that ranks over all cells, and over each group of anomalies."""
-    chosen = {title: board.anomalies} | board.groups
-    return [Mean(t, board.ranking, board.environments, a, intervals) for t, a in chosen.items()]
-
-
 def over_all(
     board: Board, names: Iterable[str], intervals: Collection[str] = (), *, short: bool = False
-) -> list[Mean]:
+) -> list[Column]:
     """Return columns of means over all cells; `short` where a heading names alarm or level."""
-    infos = map(metric_info, names)
-    titles = {info.name: info.noun if short else info.title for info in infos}
-    over = board.environments, board.anomalies
-    return [Mean(title, n, *over, n in intervals) for n, title in titles.items()]
+    infos = map(metric_info, board.present(names))
+    return [
+        Column(i.name, i.noun if short else i.title, intervals=i.name in intervals) for i in infos
+    ]
 
 
 def separability(board: Board, *, intervals: bool = False) -> Table:
@@ -178,21 +161,26 @@ def separability(board: Board, *, intervals: bool = False) -> Table:
     Beside the mean over all cells stand that of smoothed scores and that against another twin,
     where records have them.
     """
-    columns = _by_group(board, "mean", intervals=intervals)
-    over = board.environments, board.anomalies
-    present = board.present(_BESIDE_MATCHED)
-    columns += [Mean(name.removeprefix("auc_"), name, *over, intervals) for name in present]
-    columns += [Mean(e, board.ranking, [e], board.anomalies, intervals) for e in board.environments]
-    entries = best_first(board)
-    rows = [[str(entry), *texts(board, entry, columns)] for entry in entries]
+    beside = {name.removeprefix("auc_"): name for name in board.present(_BESIDE_MATCHED)}
+    columns = _by_group(board, "mean") + [Column(name, title) for title, name in beside.items()]
+    columns += [Column(board.ranking, name, [name]) for name in board.environments]
+    columns = [column._replace(intervals=intervals) for column in columns]
     title = "Separability: matched AUC (%), higher is better. The leaderboard ranks by this."
-    beside = {c.title: c.metric for c in columns if c.metric in present}
-    notes = [explained(beside), unranked(board), *reasons(board, entries, columns)]
-    note = " ".join(filter(None, notes))
-    return Table(title, ["detector", *(c.title for c in columns)], rows, note=note)
+    note = _joined(explained(beside), unranked(board))
+    return by_metric(board, title, columns, note=note, entries=best_first(board))
 
 
 _BESIDE_MATCHED: Final = ("auc_smoothed", "auc_unpaired")
+
+
+def _by_group(board: Board, title: str) -> list[Column]:
+    """Return the metric that ranks over all cells, and over each group of anomalies."""
+    of_groups = [Column(board.ranking, g, anomalies=kinds) for g, kinds in board.groups.items()]
+    return [Column(board.ranking, title), *of_groups]
+
+
+def _joined(*sentences: str) -> str:
+    return " ".join(filter(None, sentences))
 
 
 def unranked(board: Board) -> str:
@@ -204,8 +192,7 @@ def unranked(board: Board) -> str:
 
 def best_first(board: Board) -> list[Setting]:
     """Return the rows of a board by their mean of the metric that ranks them, the best first."""
-    over = board.environments, board.anomalies
-    means = {entry: board.mean(entry, *over, board.ranking).value for entry in board.entries}
+    means = {entry: board.of(entry, Column(board.ranking)).value for entry in board.entries}
     return sorted(means, key=lambda e: math.inf if math.isnan(means[e]) else -means[e])
 
 
@@ -226,28 +213,34 @@ def guaranteed(
     levels = [level for level in catalogue.LEVELS if board.present([f"false_episodes_{level}"])]
     strictest = catalogue.HEADLINE if catalogue.HEADLINE in levels or not levels else levels[-1]
     asked, suffix = suffix or catalogue.HEADLINE, suffix or strictest
-    bases = _ALARMS if not nulls else catalogue.GUARANTEED
-    names = board.present(f"{name}_{suffix}" for name in bases)
-    if not names:
+    bases = catalogue.GUARANTEED if nulls else _ALARMS
+    columns = over_all(board, [f"{name}_{suffix}" for name in bases], short=True)
+    columns = [_with_ends(column, every=intervals) for column in columns]
+    if not columns:
         return None
-    with_ends = [n for n in names if intervals or metric_info(n).interval == "exact"]
-    columns = over_all(board, names, with_ends, short=True)
-    level = f"{100 * catalogue.LEVELS[suffix]:g} %"
+    names = [column.metric for column in columns]
+    level = _percent_of(suffix)
     hours = f"false_alarms_per_hour_{suffix}"
     hourly = f"{metric_info(hours).noun}, " * (hours in names)
     steps = "delays in steps, " * any(name.startswith("delay") for name in names)
     units = f"{steps}{hourly}the rest in %" if steps or hourly else "%"
-    title = f"Guaranteed alarms at {level} ({units})"
     episodes = "nominal twins" if board.paired else "nominal test episodes"
-    note = (
+    note = _joined(
         f"The threshold promises an alarm in at most {level} of nominal episodes; false episodes "
-        f"is the share of this split's {episodes} that raised one."
+        f"is the share of this split's {episodes} that raised one.",
+        CENSORED * (f"delay_censored_{suffix}" in names),
+        *(lowered_level(board, asked, suffix) if asked != suffix else ()),
     )
-    if f"delay_censored_{suffix}" in names:
-        note = f"{note} {CENSORED}"
-    if asked != suffix:
-        note = " ".join([note, *lowered_level(board, asked, suffix)])
-    return by_metric(board, title, columns, standings, note)
+    return by_metric(board, f"Guaranteed alarms at {level} ({units})", columns, standings, note)
+
+
+def _percent_of(suffix: str) -> str:
+    return f"{100 * catalogue.LEVELS[suffix]:g} %"
+
+
+def _with_ends(column: Column, *, every: bool) -> Column:
+    """Return a column with intervals where `every` one has them, or they are exact."""
+    return column._replace(intervals=every or metric_info(column.metric).interval == "exact")
 
 
 CENSORED: Final = "Delay censored counts a miss as the whole remainder of its episode."
@@ -256,23 +249,21 @@ CENSORED: Final = "Delay censored counts a miss as the whole remainder of its ep
 
 def missing_level(board: Board, suffix: str) -> list[str]:
     """Return how many calibration episodes a level takes that rows have no figures at."""
-    level = f"guaranteed alarms at {100 * catalogue.LEVELS[suffix]:g} %"
-    column = Mean(level, f"false_episodes_{suffix}", board.environments, board.anomalies)
-    return reasons(board, board.entries, [column])
+    title = f"guaranteed alarms at {_percent_of(suffix)}"
+    return reasons(board, board.entries, [Column(f"false_episodes_{suffix}", title)])
 
 
 def lowered_level(board: Board, asked: str, level: str) -> list[str]:
     """Return which rows have no figures at a level, and that another stands for all rows."""
     lacking = missing_level(board, asked)
     if level != asked and lacking:
-        lacking.append(f"So all rows are shown at {100 * catalogue.LEVELS[level]:g} %.")
+        lacking.append(f"So all rows are shown at {_percent_of(level)}.")
     return lacking
 
 
 def papers(board: Board, standings: Sequence[Standing] = (), *, intervals: bool = False) -> Table:
     """Return what the paper's alarm does, mean over cells, under a heading of its own."""
-    names = board.present(_PAPER)
-    columns = over_all(board, names, names if intervals else (), short=True)
+    columns = over_all(board, _PAPER, _PAPER if intervals else (), short=True)
     note = explained({c.title: c.metric for c in columns if c.metric in _PAPERS_NULLS})
     title = f"{PAPER} (delays in steps, the rest as shares)"
     return by_metric(board, title, columns, standings, note)
@@ -288,21 +279,162 @@ def attribution(
     board: Board, *, intervals: bool = False, standings: Sequence[Standing] = ()
 ) -> Table | None:
     """Return what detectors that explain say at their guaranteed alarms; None without any."""
-    explaining = {r.setting for r in board.records if r.metrics.keys() & {*catalogue.ATTRIBUTION}}
+    names = catalogue.ATTRIBUTION
+    explaining = {r.setting for r in board.records if r.metrics.keys() & {*names}}
     if not explaining:
         return None
-    names = catalogue.ATTRIBUTION
     if not standings:
         board = Board([r for r in board.records if r.setting in explaining])
-    columns = over_all(board, names, names if intervals else (), short=True)
+    columns = [Column(n, metric_info(n).noun, intervals=intervals) for n in names]
     title = f"Attribution at {metric_info(names[0]).level} (onset error in rows, the rest in %)"
-    note = (
-        "Of the detectors that explain their scores, at the first guaranteed alarm: how often the "
-        "sensor that they name first is a corrupted one, over sensor anomalies, and how far the "
-        "onset that they name is from the effect, the median of a cell."
-    )
     ranks = [standing for standing in standings if standing.entry in explaining]
-    return by_metric(board, title, columns, ranks, note)
+    return by_metric(board, title, columns, ranks, _ATTRIBUTION)
+
+
+_ATTRIBUTION: Final = (
+    "Of the detectors that explain their scores, at the first guaranteed alarm: how often the "
+    "sensor that they name first is a corrupted one, over sensor anomalies, and how far the onset "
+    "that they name is from the effect, the median of a cell."
+)
+
+
+def of_logs(
+    board: Board,
+    *,
+    intervals: bool = False,
+    standings: Sequence[Standing] = (),
+    level: str = "",
+    whole: bool = False,
+) -> list[Table]:
+    """Return the tables of a board without twins, the most important one first.
+
+    Parameters
+    ----------
+    board
+        The board.
+    intervals
+        Whether all means have their 95 % interval; false episodes always have.
+    standings
+        Where there are some, rows are in their order and have their places; else they are in the
+        order of their means, the best first.
+    level
+        Suffix of the level of guaranteed alarms, by default the board's.
+    whole
+        Whether each of several environments has a headline of its own, too.
+    """
+    suffix = level or board.level
+    entries = [row.entry for row in standings] or best_first(board)
+
+    def present(names: Iterable[str], environments: Sequence[str] = ()) -> list[str]:
+        some = [r for r in board.records if not environments or r.environment in environments]
+        return [name for name in names if cells_with(name, some)]
+
+    def table(
+        title: str, names: Iterable[str], environments: Sequence[str] = (), note: str = ""
+    ) -> Table:
+        columns = []
+        for info in map(metric_info, present(names, environments)):
+            text = _heading(info.name) + " (steps)" * (info.unit == "steps")
+            text += f" (≤ {_percent_of(suffix)})" * info.name.startswith("false_episodes")
+            columns.append(_with_ends(Column(info.name, text, environments), every=intervals))
+        title += f" at {_percent_of(suffix)}" * any(metric_info(c.metric).level for c in columns)
+        title += f": {', '.join(environments)}" * bool(environments)
+        asked = level or catalogue.HEADLINE
+        if f"false_episodes_{asked}" not in [c.metric for c in columns]:
+            note = _joined(note, *lowered_level(board, asked, suffix))
+        return by_metric(board, title, columns, standings, note, entries)
+
+    def at_level(*names: str) -> list[str]:
+        return [f"{name}_{suffix}" for name in names]
+
+    def headline(*environments: str) -> Iterable[Table]:
+        alarms = at_level(*_ALARMS_OF_LOGS)
+        if present((POOLED[-1], alarms[0]), environments):
+            title = "Separability (%, higher is better)"
+            title += " and guaranteed alarms" * bool(present(alarms, environments))
+            first = {_heading(name): name for name in present((*POOLED[:2], alarms[0]))}
+            note = CENSORED * bool(present([f"delay_censored_{suffix}"]))
+            note = note if environments else _joined(explained(first), note)
+            yield table(title, (*POOLED, *alarms), environments, note)
+
+    def outcomes() -> Iterable[Table]:
+        if present(["auc_outcome"]):
+            names = ["auc_outcome", *at_level("found_outcome", "found_outcome_null")]
+            names += [] if [*headline()] else [*POOLED, *nominal_alarms]
+            note = "Episodes are compared up to the same row, as failures run into the time limit."
+            if all(entry.detector != CLOCK for entry in board.entries):
+                note += (
+                    f" Add the row {CLOCK} (--detector ...,{CLOCK}) to see how much of this the "
+                    "phase of the episode alone gives."
+                )
+            yield table("Episodes known by their outcome alone (%)", names, note=note)
+
+    def nominal() -> Iterable[Table]:
+        judged = *POOLED, "auc_outcome"
+        alone = [e for e in board.environments if not present(judged, [e])]
+        if alone and present(nominal_alarms, alone):
+            some = alone if alone != board.environments else ()
+            yield table("Alarms on nominal test episodes alone", nominal_alarms, some)
+
+    nominal_alarms = at_level("false_episodes", "false_alarms_per_hour")
+    single = board.environments if whole and len(board.environments) > 1 else []
+    compared = [e for e in board.environments if present([board.ranking], [e])]
+    return [
+        *(*headline(), *outcomes(), *nominal()),
+        *_apart(board, compared, entries, standings, intervals=intervals),
+        *itertools.chain.from_iterable(map(headline, single)),
+        *([table(_OF_ROWS, ROWS)] if present(ROWS) else []),
+    ]
+
+
+_OF_ROWS: Final = "Metrics of rows, for comparison with published tables; they rank nothing"
+
+
+def _apart(
+    board: Board,
+    compared: Sequence[str],
+    entries: Sequence[Setting],
+    standings: Sequence[Standing],
+    *,
+    intervals: bool,
+) -> Iterable[Table]:
+    """Yield the metric that ranks by environment and group, where there is more than one.
+
+    `compared` are the environments that have it. Their mean counts each of them once.
+    """
+    several = compared if len(compared) > 1 else []
+    parts = [Column(board.ranking, e, [e], (), intervals) for e in several]
+    columns = parts + [c._replace(intervals=intervals) for c in _by_group(board, "")[1:]]
+    if not columns or not compared:
+        return
+    by = " and ".join(["environment"] * bool(several) + ["group"] * bool(board.groups))
+    title = metric_info(board.ranking).title
+    title = f"{title[0].upper()}{title[1:]} (%) by {by}"
+    table = by_metric(board, title, columns, standings, entries=entries)
+    if several:
+        means = [["mean", *(_mean(board, entry, parts) for entry in entries)]]
+        lines = zip((table.header, *table.rows), *means, strict=True)
+        header, *rows = [[*t[: table.labels], mean, *t[table.labels :]] for t, mean in lines]
+        note = "The mean is that of the environments, each counting once."
+        table = replace(table, header=header, rows=rows, note=note)
+    yield table
+
+
+def _mean(board: Board, entry: Setting, columns: Sequence[Column]) -> str:
+    """Return a row's mean of columns, each counting once, as printed."""
+    means = [board.of(entry, column._replace(intervals=False)) for column in columns]
+    defined = [mean for mean in means if mean.state or not math.isnan(mean.value)]
+    value = Value(
+        nan_mean(mean.value for mean in defined),
+        state=next((mean.state for mean in defined if mean.state), ""),
+        cells=sum(mean.cells for mean in means),
+        partial=0 < len(defined) < len(means) or any(mean.partial for mean in defined),
+    )
+    return show_value(value, board.ranking)
+
+
+def _heading(name: str) -> str:
+    return "null" if name == POOLED[1] else metric_info(name).noun
 
 
 def anomaly_groups(board: Board, *, intervals: bool = False) -> list[Table]:
@@ -310,11 +442,14 @@ def anomaly_groups(board: Board, *, intervals: bool = False) -> list[Table]:
 
     There is a table for each horizon and group of anomalies, and none where records lack all three.
     """
-    if not board.present(("auc", "delay", "far")):
+    if not board.present(_TABLE_5):
         return []
     groups = filter(board.in_group, GROUPS)
     everything = itertools.product(board.horizons, groups)
     return [_anomaly_group(board, h, group, intervals=intervals) for h, group in everything]
+
+
+_TABLE_5: Final = ("auc", "delay", "far")
 
 
 def _anomaly_group(board: Board, horizon: int, group: str, *, intervals: bool) -> Table:
@@ -322,9 +457,9 @@ def _anomaly_group(board: Board, horizon: int, group: str, *, intervals: bool) -
     entries = [e for e in board.entries if e.horizon == horizon]
     averaged = [e for e in entries if not board.is_trivial(e)] or entries
     rows = []
-    for environment, metric in itertools.product(board.environments, ("auc", "delay", "far")):
-        over = [environment], board.in_group(group), metric
-        means = {e: board.mean(e, *over, intervals=intervals) for e in entries}
+    for environment, metric in itertools.product(board.environments, _TABLE_5):
+        column = Column(metric, "", [environment], board.in_group(group), intervals)
+        means = {e: board.of(e, column) for e in entries}
         partial = any(means[e].state or means[e].partial for e in averaged)
         average = Value(nan_mean(means[e].value for e in averaged), cells=1, partial=partial)
         labels = [title_of(environment), metric_info(metric).short]
@@ -334,19 +469,19 @@ def _anomaly_group(board: Board, horizon: int, group: str, *, intervals: bool) -
     header = ["Environment", "Result", *(str(replace(e, horizon=1)) for e in entries), "AVG"]
     left_out = [str(e) for e in entries if e not in averaged]
     note = f"AVG is the mean without the trivial rows: {', '.join(left_out)}." if left_out else ""
-    if len(board.environments) == 1:  # the title says it
-        title += f", {title_of(board.environments[0])}"
-        return Table(title, header[1:], [row[1:] for row in rows], labels=1, note=note)
-    return Table(title, header, rows, labels=2, note=note)
+    table = Table(title, header, rows, labels=2, note=note)
+    if len(board.environments) > 1:
+        return table
+    title += f", {title_of(board.environments[0])}"
+    return replace(table.columns(range(1, len(header))), title=title, labels=1)
 
 
 def all_metrics(board: Board, *, intervals: bool = False) -> Table:
     """Return every metric without an alarm, mean over all cells, with nulls and the placebo."""
     usual = [n for n, info in catalogue.METRICS.items() if info.cells != "unpaired"]
-    names = board.present(catalogue.METRICS) or usual
-    infos = map(metric_info, names)
-    names = [info.name for info in infos if not info.request and not info.paper]
-    columns = over_all(board, names, names if intervals else ())
+    infos = map(metric_info, board.present(catalogue.METRICS) or usual)
+    shown = [info for info in infos if not info.request and not info.paper]
+    columns = [Column(info.name, info.title, intervals=intervals) for info in shown]
     return by_metric(board, "All metrics of separability (%), mean over cells", columns)
 
 
@@ -358,16 +493,14 @@ def all_alarms(board: Board, *, intervals: bool = False) -> list[Table]:
 
 def by_anomaly(board: Board, entry: Setting, metric: str = "", *, intervals: bool = False) -> Table:
     """Return one detector's metric by environment and anomaly, by default the one that ranks."""
-    metric = metric or board.ranking
-    rows, columns = [], []
-    for e in board.environments:
-        of_environment = [Mean(a, metric, [e], [a], intervals) for a in board.anomalies]
-        rows.append([title_of(e), *texts(board, entry, of_environment)])
-        columns += of_environment
-    note = " ".join(reasons(board, [entry], columns))
-    info = metric_info(metric)
-    unit = " (%)" if info.unit == "percent" else ""
-    title = f"{entry}: {info.title}{unit} by anomaly"
+    info = metric_info(metric or board.ranking)
+    cells = {
+        e: [Column(info.name, a, [e], [a], intervals) for a in board.anomalies]
+        for e in board.environments
+    }
+    rows = [[title_of(e), *texts(board, entry, columns)] for e, columns in cells.items()]
+    note = " ".join(reasons(board, [entry], itertools.chain.from_iterable(cells.values())))
+    title = f"{entry}: {info.title}{' (%)' * (info.unit == 'percent')} by anomaly"
     header = ["Environment", *board.anomalies]
     return Table(title, header, rows, note=note, wrap=not board.paired)
 
@@ -381,27 +514,30 @@ def failures(board: Board) -> Table | None:
 
 def ranking(ranks: RankedBoard, trust: Mapping[Setting, str]) -> Table:
     """Return ranks by separability, with what a reader needs to judge them; trust is by row."""
-    title = metric_info(ranks.board.ranking).title
-    columns = _by_group(ranks.board, title, intervals=True)
-    beside: Sequence[str] = ("auc_smoothed", "auc_unpaired", "auc", "auc_placebo")
-    if not ranks.board.paired:
-        beside = ranks.board.present(n for n in _BESIDE if n != ranks.board.ranking)
-    columns += over_all(ranks.board, beside)
+    board = ranks.board
+    title = metric_info(board.ranking).title
+    columns = [c._replace(intervals=True) for c in _by_group(board, title)]
+    names = [n for n in _BESIDE[board.paired] if n != board.ranking]
+    names = names if board.paired else board.present(names)
+    columns += [Column(name, metric_info(name).title) for name in names]
     rows = []
     for row in ranks.standings:
         rank, detector, settings = _labels(row)
         inputs = row.inputs.replace("observations+actions", "+actions") or UNDEFINED
         labels = [rank, row.ties or UNDEFINED, row.printed(row.alarm_rank), detector, settings]
         labels += [inputs, trust.get(row.entry, UNDEFINED)]
-        means = texts(ranks.board, row.entry, columns)
+        means = texts(board, row.entry, columns)
         rows.append([*labels, *means, _percent(row.wins), row.lead or UNDEFINED])
     labels = ["rank", "ties", "alarm rank", "detector", "settings", "inputs", "trust"]
     header = [*labels, *(c.title for c in columns), "win rate", "lead"]
     return Table(f"Ranking by {title} (%)", header, rows, labels=7)
 
 
-_BESIDE: Final = ("auc_pool_null", "auc_rows", "auc_outcome")
-"""Columns beside the metric that ranks rows without twins."""
+_BESIDE: Final = {
+    True: ("auc_smoothed", "auc_unpaired", "auc", "auc_placebo"),
+    False: ("auc_pool_null", "auc_rows", "auc_outcome"),
+}
+"""Columns beside the metric that ranks, of rows with twins and without."""
 
 
 def cost(ranks: RankedBoard) -> Table:
@@ -442,6 +578,38 @@ def findings(board: Board) -> list[str]:
                     f"against {info.text(lower)} over {counted(cells, 'cell(s)')}."
                 )
     return sentences
+
+
+def phase_findings(board: Board) -> list[str]:
+    """Return a sentence where what knows the time alone does as well as detectors within episodes.
+
+    Left out are rows that nobody takes for a detector of dynamics, rows at chance, which follow no
+    phase either, and environments whose episodes have no phase that they share: their pooled AUC
+    compares rows of all numbers, where that of the clock is not one half by ties alone.
+    """
+    info = metric_info("auc_rows")
+    sentences = []
+    for clock in (entry for entry in board.entries if entry.detector == CLOCK):
+        pooled = {e: board.of(clock, Column(POOLED[0], "", [e])) for e in board.environments}
+        records = [r for r in board.records if pooled[r.environment].value == 0.5]
+        if not records:
+            continue
+        part, listed = Board(records), []
+        for entry in (e for e in part.entries if e.detector not in _SENSELESS):
+            phase, value, _ = part.compare(clock, entry, info.name)
+            mean = part.of(entry, Column(info.name, intervals=True))
+            if phase >= value and not mean.low <= 0.5 <= mean.high:
+                listed.append(f"{entry} ({info.text(value)} against {info.text(phase)})")
+        if listed:
+            sentences.append(
+                f"{clock}, which knows the time alone, is as good as or better than these rows in "
+                f"{info.title}, which then is the phase of the episode, not the dynamics: "
+                f"{', '.join(listed)}."
+            )
+    return sentences
+
+
+_SENSELESS: Final = (*BLIND, "random")  # rows whose AUC nobody takes for the dynamics
 
 
 def withheld(board: Board) -> list[str]:
@@ -590,16 +758,18 @@ _RANK: Final = (
 def by_metric(
     board: Board,
     title: str,
-    columns: Sequence[Mean],
+    columns: Sequence[Column],
     standings: Sequence[Standing] = (),
     note: str = "",
+    entries: Sequence[Setting] = (),
 ) -> Table:
     """Return columns with a row per detector, or per standing with its place."""
-    labels = {row.entry: _labels(row) for row in standings} or {e: [str(e)] for e in board.entries}
+    labels = {row.entry: _labels(row) for row in standings}
+    labels = labels or {e: [str(e)] for e in entries or board.entries}
     rows = [[*label, *texts(board, entry, columns)] for entry, label in labels.items()]
     first = _LABELS if standings else ("detector",)
     header = [*first, *(c.title for c in columns)]
-    note = " ".join(filter(None, [note, *reasons(board, labels, columns)]))
+    note = _joined(note, *reasons(board, labels, columns))
     return Table(title, header, rows, labels=len(first), note=note, wrap=not board.paired)
 
 
@@ -622,3 +792,51 @@ def _digits(value: float) -> str:
     if 0 < value < 0.001:
         return "< 0.001"
     return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
+
+
+def why_undefined(record: Record, metric: str) -> str:
+    """Return why a record has no value of a metric; empty where it has one, or no reason is known.
+
+    Parameters
+    ----------
+    record
+        Of a cell; one that failed has its own reason.
+    metric
+        See ``oodd-eval list metrics``.
+
+    Returns
+    -------
+    str
+        A phrase without a full stop.
+    """
+    if not record.ok or not math.isnan(record.value(metric)):
+        return ""
+    info = metric_info(metric)
+    if metric in record.metrics:
+        return info.undefined
+    if info.cells == "paired" and not record.paired:
+        return "the episodes have no nominal twins"
+    if info.cells == "unpaired" and record.paired:
+        return "it is for episodes without nominal twins"
+    withheld, _, reason = record.note.partition(" are withheld: ")
+    if metric in withheld.split(", "):
+        return reason
+    if info.level and (reason := _left_out(record, metric)):
+        return reason
+    if metric in catalogue.ATTRIBUTION:
+        return "the detector does not explain its scores"
+    if record.condition == NOMINAL:
+        return "there are no anomalous episodes"
+    return "it is computed with --row-metrics alone" if info.request else ""
+
+
+def _left_out(record: Record, metric: str) -> str:
+    """Return how many calibration episodes a metric's level takes; empty if there are enough."""
+    suffix = f"at_{metric.rpartition('_at_')[2]}"
+    for note in record.note.split("; "):  # a rolling calibration takes more
+        if note.startswith(f"guaranteed alarms at {metric_info(metric).level} are left out: "):
+            return note.partition(": ")[2]
+    episodes = record.counts.get("calibration")
+    if episodes is None or suffix in offered_levels(episodes, record.alarm):
+        return ""
+    return _too_few(episodes, catalogue.LEVELS[suffix], record.alarm)

@@ -28,8 +28,7 @@ from oodd_eval.results.render import FORMATS
 from oodd_eval.results.render.text import print_table
 from oodd_eval.results.report import Report, findings_of
 from oodd_eval.results.standings import compare_rows, verdict_of
-from oodd_eval.results.tables import Table
-from oodd_eval.results.undefined import why_undefined
+from oodd_eval.results.tables import Table, why_undefined
 
 
 def rendered(records, name="markdown", **settings):

@@ -23,7 +23,6 @@ from oodd_eval.results.render.text import print_sections
 from oodd_eval.results.report import Report, findings_of, flat
 from oodd_eval.results.standings import compare_rows, ranked
 from oodd_eval.results.strengths import by_place, strength_tables, thresholds
-from oodd_eval.results.unpaired import UnpairedTables
 
 TWIN_WORDS = ("twin", "matched", "placebo", "unpaired", "smoothed")
 
@@ -205,7 +204,7 @@ def test_outcomes_are_one_table_with_the_clock_in_it_and_rank():
     ranks = ranked(records)
     assert ranks.board.ranking == "auc_outcome"
     assert list(ranks.alarms.ranks) == ["mewma", "clock"]
-    alone = UnpairedTables(Board(records[1:])).outcomes()
+    (alone,) = tables.of_logs(Board(records[1:]))
     assert ("clock" in alone.note, "clock" in first.note) == (True, False)
     # Guaranteed alarms without delays speak of none.
     titles = [table.title for table in tables.all_alarms(Board(records))]
