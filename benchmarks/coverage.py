@@ -192,7 +192,7 @@ class Calibrated:
         if not draw or not self.noise:
             return terms
         again = Recalibration.fit(calibration, self.alarm, environment)
-        (draws,) = again.paired(twins, [PairedScores(anomalous, effects, effects)])
+        (draws,) = again.of_cells([PairedScores(anomalous, twins, *[effects.tolist()] * 2)])
         kept = CodedDraws.of({self.metric: draws[self.metric]})
         return replace(terms, deviations=kept[self.metric])
 

@@ -26,7 +26,7 @@ from oodd_eval.errors import PromiseWarning
 from oodd_eval.results.board import boards
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.render.text import markdown_table
-from oodd_eval.results.tables import of_logs
+from oodd_eval.results.tables import Tables
 from oodd_eval.scoring.promises import promises_of
 
 ROOT = Path(__file__).parents[1]
@@ -112,7 +112,7 @@ def tables_of(records):
         (environment,) = board.environments
         texts = [
             re.sub(r"^### (.*)", r"**\1**", markdown_table(table)).strip()
-            for table in of_logs(board)
+            for table in Tables(board).of_logs()
             if " by " not in table.title and "Metrics of rows" not in table.title
         ]
         pages[sets[environment]] = "\n\n".join(texts)

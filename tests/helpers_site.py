@@ -26,6 +26,7 @@ from oodd_eval.metrics.auc import AlarmRule, Contribution
 from oodd_eval.metrics.catalogue import GUARANTEED, RANKING
 from oodd_eval.metrics.curves import Sweep, cell_curves, thresholds
 from oodd_eval.metrics.cusum import Standardization
+from oodd_eval.metrics.recalibration import PairedScores
 from oodd_eval.results.compare import write_reference
 from oodd_eval.results.curve_file import write_curves
 from oodd_eval.results.evaluate import metric_of
@@ -105,7 +106,7 @@ def make_curves(record, seed, twins_seed=0):
         "cell": str(record.cell), "detector": record.detector, "horizon": record.horizon,
         "seed": record.seed, "overrides": record.overrides,
         "environment": record.environment, "anomaly": record.anomaly,
-        **cell_curves(sweep, rule, anomalous, onsets, onsets),
+        **cell_curves(PairedScores(anomalous, twins, onsets, onsets), sweep, rule),
     }  # fmt: skip
 
 

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from oodd_eval._version import repository
 from oodd_eval.data.facts import SPLITS, title_of
@@ -22,7 +22,7 @@ from oodd_eval.results.render.data import cells_csv, comparisons_csv, ranking_cs
 from oodd_eval.results.render.text import escape, markdown_body, markdown_list, markdown_table
 from oodd_eval.results.report import Section, findings_of
 from oodd_eval.results.standings import RankedBoard, primary_settings, verdict_of
-from oodd_eval.results.tables import Table
+from oodd_eval.results.tables import Table, Tables
 from oodd_leaderboard import site
 from oodd_leaderboard.entry import (
     SUITES,
@@ -188,18 +188,14 @@ def _section(section: LeaderboardSection) -> str:
     files = ", ".join(f"[{kind}]({section.file(kind)})" for kind in kinds)
     cells = f"{len(board.records)}, of which {ok} ok and {len(board.records) - ok} failed"
     size = f"Digest {escape(board.digest)}. Rows: {len(ranks.standings)}. Cells: {cells}."
-    settings: dict[str, Any] = {"intervals": True, "standings": ranks.standings}
-    of_scores: Sequence[Table | None] = (
-        [tables.separability(board), tables.guaranteed(board, **settings)]
-        if board.paired
-        else tables.of_logs(board, whole=True, **settings)
-    )
+    plain, placed = Tables(board), Tables(board, intervals=True, standings=ranks.standings)
     body_tables = [
-        *of_scores,
-        tables.attribution(board, **settings),
+        *(() if board.paired else placed.of_logs(whole=True)),
+        *((plain.separability(), placed.guaranteed()) if board.paired else ()),
+        placed.attribution(),
         tables.cost(ranks),
-        tables.all_metrics(board),
-        *tables.all_alarms(board),
+        plain.all_metrics(),
+        *plain.all_alarms(),
         *(_of_paper(ranks) if board.paired else ()),
         tables.wins(ranks) if len(ranks.ranking.ranks) <= WIDEST else None,
         tables.failures(board),
@@ -295,8 +291,8 @@ def _of_paper(ranks: RankedBoard) -> list[Table]:
     That has a column per row of the board, so that it is kept to rows with default parameters.
     """
     records = [r for r in ranks.board.records if not r.overrides]
-    as_in_the_paper = tables.anomaly_groups(Board(records)) if records else []
-    return [tables.papers(ranks.board, ranks.standings), *as_in_the_paper]
+    as_in_the_paper = Tables(Board(records)).anomaly_groups() if records else []
+    return [Tables(ranks.board, standings=ranks.standings).papers(), *as_in_the_paper]
 
 
 def _entry(entry: SubmittedEntry) -> str:

@@ -32,13 +32,13 @@ from oodd_eval.data.bounded import MANIFEST_BYTES, read_bytes
 from oodd_eval.data.facts import ENVIRONMENTS, TABLE1
 from oodd_eval.data.files import find_file, write_text
 from oodd_eval.errors import ResultsError
-from oodd_eval.results import strengths, tables
 from oodd_eval.results.board import Board, boards, expected_cells, grouped
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
 from oodd_eval.results.standings import RankedBoard, primary_settings, ranked
-from oodd_eval.results.tables import Table
+from oodd_eval.results.strengths import StrengthTables
+from oodd_eval.results.tables import Table, Tables
 
 _T = TypeVar("_T")
 
@@ -346,9 +346,9 @@ def suite_sections(directory: Path) -> list[SuiteSection]:
     suites = []
     for path in filter(Path.is_dir, sorted((directory / SUITES).glob("*"))):
         for board in boards(ResultsDirectory(path).records()):
-            graded = strengths.strength_tables(board) if board.paired else []
-            suite_tables = graded or [tables.separability(board)]
-            suite_tables = suite_tables if board.paired else tables.of_logs(board)
+            graded = StrengthTables(board).overview() if board.paired else []
+            suite_tables = graded or [Tables(board).separability()]
+            suite_tables = suite_tables if board.paired else Tables(board).of_logs()
             suites.append(SuiteSection(path.name, board, suite_tables, graded=bool(graded)))
     return suites
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from oodd_eval.metrics.alarms import GuaranteedAlarm
 from oodd_eval.metrics.auc import AlarmRule, Floats, auc_same_times, first_delay
 from oodd_eval.metrics.cusum import THRESHOLD, UNIT, Alarms, cusum
+from oodd_eval.metrics.recalibration import PairedScores
 from oodd_eval.metrics.unpaired import LEAST_NOMINAL, UnpairedScores, anomalous_rows
 
 FPR: Final = tuple((i / 24) ** 2 for i in range(25))
@@ -177,56 +178,46 @@ def _drawn(
     return dict(zip(names, (standardized, statistic[rows].tolist(), at), strict=True))
 
 
-def cell_curves(
-    sweep: Sweep,
-    rule: AlarmRule,
-    anomalous: Sequence[Floats],
-    onsets: Sequence[int],
-    effects: Sequence[int],
-) -> dict[str, Any]:
-    """Return the three curves of one cell, rounded for drawing; `rule` is that of the example."""
-    return _curves(
-        mean_matched_roc(anomalous, sweep.twins, effects),
-        delay_far(sweep, anomalous, onsets),
-        example(anomalous, sweep.twins, onsets, effects, rule),
-    )
-
-
-def _curves(tpr: Floats, delays: dict[str, list[float]], drawn: dict[str, Any]) -> dict[str, Any]:
-    defined = not np.isnan(tpr).any()
-    roc_curve = {"fpr": list(FPR) if defined else [], "tpr": tpr.tolist() if defined else []}
-    curves: dict[str, Any]
-    curves = rounded({"roc": roc_curve, "delay_far": delays, "example": drawn})
-    return curves
-
-
 LONGEST: Final = 600  # most rows of an example without twins
 
 
-def unpaired_curves(cell: UnpairedScores, sweep: Sweep, rule: AlarmRule) -> dict[str, Any]:
-    """Return the three curves of a cell without twins, rounded for drawing.
+def cell_curves(
+    cell: PairedScores | UnpairedScores, sweep: Sweep, rule: AlarmRule
+) -> dict[str, Any]:
+    """Return the three curves of a cell, rounded for drawing.
 
     Parameters
     ----------
     cell
         The scores, of at least one anomalous episode.
     sweep
-        Alarms on the nominal test episodes.
+        Alarms on the twins, or on the nominal test episodes.
     rule
         That of the example.
 
     Returns
     -------
     dict
-        ``roc`` is the curve of ``auc_pool``, ``delay_far`` that of delays from the first interval
-        on, and ``example`` the episode with the median pooled AUC.
+        ``roc``, ``delay_far`` and ``example``. Without twins ``roc`` is the curve of ``auc_pool``,
+        ``delay_far`` that of delays from the first interval on, and ``example`` the episode with
+        the median pooled AUC.
     """
-    areas, curve = pooled_roc(cell)
-    starts = {i: cell.intervals[i][0][0] for i in cell.labelled}
-    known = {i: start for i, start in starts.items() if 0 <= start < len(cell.anomalous[i])}
-    episodes = [cell.anomalous[i] for i in known]
-    delays = delay_far(sweep, episodes, [*known.values()], paired=False)
-    return _curves(curve, delays, _unpaired_example(cell, areas, rule))
+    if isinstance(cell, PairedScores):
+        tpr = mean_matched_roc(cell.anomalous, cell.twins, cell.effects)
+        delays = delay_far(sweep, cell.anomalous, cell.onsets)
+        drawn = example(*cell, rule)
+    else:
+        areas, tpr = pooled_roc(cell)
+        starts = {i: cell.intervals[i][0][0] for i in cell.labelled}
+        known = {i: start for i, start in starts.items() if 0 <= start < len(cell.anomalous[i])}
+        episodes = [cell.anomalous[i] for i in known]
+        delays = delay_far(sweep, episodes, [*known.values()], paired=False)
+        drawn = _unpaired_example(cell, areas, rule)
+    defined = not np.isnan(tpr).any()
+    roc_curve = {"fpr": list(FPR) if defined else [], "tpr": tpr.tolist() if defined else []}
+    curves: dict[str, Any]
+    curves = rounded({"roc": roc_curve, "delay_far": delays, "example": drawn})
+    return curves
 
 
 def pooled_roc(

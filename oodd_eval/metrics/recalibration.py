@@ -153,11 +153,12 @@ def thresholds(largest: Floats, draws: Drawn, rank: int) -> Floats:
 
 
 class PairedScores(NamedTuple):
-    """Scores of the n anomalous episodes of a cell, with their onsets and effects."""
+    """Scores of the n anomalous episodes of a cell and of their twins, with onsets and effects."""
 
     anomalous: Sequence[Floats]
-    onsets: NDArray[np.int64]
-    effects: NDArray[np.int64]
+    twins: Sequence[Floats]
+    onsets: Sequence[int]
+    effects: Sequence[int]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -226,23 +227,30 @@ class Recalibration:
             np.copyto(sums, 0.0, where=row)
         return alarms
 
-    def paired(self, twins: Sequence[Floats], cells: Sequence[PairedScores]) -> list[Draws]:
-        """Return the metrics of alarms of cells with twins in every draw, in the cells' order.
+    def of_cells(
+        self, cells: Sequence[PairedScores | UnpairedScores], rate: float | None = None
+    ) -> list[Draws]:
+        """Return the metrics of alarms of cells in every draw, in the cells' order.
 
         Parameters
         ----------
-        twins
-            Scores of the n twins, which all cells share.
         cells
-            Of one environment.
+            Of one environment; those with twins share them.
+        rate
+            Without twins, rows in a second, for alarms per hour; None leaves these out.
 
         Returns
         -------
         list of dict
             For each cell, values by metric: shape (draws,), NaN where undefined.
         """
+        paired = [cell for cell in cells if isinstance(cell, PairedScores)]
+        alone = [cell for cell in cells if isinstance(cell, UnpairedScores)]
+        return self._paired(paired) if paired else [self._unpaired(cell, rate) for cell in alone]
+
+    def _paired(self, cells: Sequence[PairedScores]) -> list[Draws]:
         values: list[Draws] = []
-        parts = [twins, *(cell.anomalous for cell in cells)]
+        parts = [cells[0].twins, *(cell.anomalous for cell in cells)]
         quiet: _Alarms | None = None
         for block in _blocks([len(part) for part in parts]):
             pooled = [scores for i in block for scores in parts[i]]
@@ -257,8 +265,7 @@ class Recalibration:
                     values.append(_paired(loud, quiet, cells[i - 1]))
         return values
 
-    def unpaired(self, cell: UnpairedScores, rate: float | None) -> Draws:
-        """Return the metrics of alarms of a cell without twins in every draw, see `paired`."""
+    def _unpaired(self, cell: UnpairedScores, rate: float | None) -> Draws:
         values: dict[str, list[float]] = {}
         for suffix, threshold in self.thresholds.items():
             for i, height in enumerate(threshold.tolist()):
@@ -318,21 +325,22 @@ class _Alarms:
 
 def _paired(loud: _Alarms, quiet: _Alarms, cell: PairedScores) -> Draws:
     """Return the metrics of alarms of one cell in every draw."""
-    delays = loud.delays(cell.onsets)
+    onsets, effects = (np.array(rows, np.int64) for rows in (cell.onsets, cell.effects))
+    delays = loud.delays(onsets)
     missed = np.isnan(delays)
     values = {
         "delay": delays,
-        "delay_null": quiet.delays(cell.onsets),
-        "delay_censored": np.where(missed, loud.lengths - cell.onsets, delays),
+        "delay_null": quiet.delays(onsets),
+        "delay_censored": np.where(missed, loud.lengths - onsets, delays),
         "missed": missed.astype(np.float64),
     }
     ends = np.minimum(loud.lengths, quiet.lengths)
     for suffix, firsts in loud.firsts.items():
         nulls = quiet.firsts[suffix]
         values[f"false_episodes_{suffix}"] = ~np.isnan(nulls) * 1.0
-        for name, of_cell in start_terms(firsts, loud.lengths, ends, cell.effects).items():
+        for name, of_cell in start_terms(firsts, loud.lengths, ends, effects).items():
             values[f"{name}_{suffix}"] = of_cell
-        for name, of_null in start_terms(nulls, quiet.lengths, ends, cell.effects).items():
+        for name, of_null in start_terms(nulls, quiet.lengths, ends, effects).items():
             values[f"{name}_null_{suffix}"] = of_null
     means = {name: _means(terms) for name, terms in values.items()}
     means["far"] = loud.rate([slice(FAR_START, int(t)) for t in cell.onsets])

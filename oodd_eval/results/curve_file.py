@@ -19,10 +19,10 @@ from oodd_eval.data.parts import CALIBRATION, TWINS
 from oodd_eval.data.split import Split
 from oodd_eval.errors import ResultsError
 from oodd_eval.metrics.auc import AlarmRule
-from oodd_eval.metrics.curves import Sweep, cell_curves, thresholds, unpaired_curves
+from oodd_eval.metrics.curves import Sweep, cell_curves, thresholds
 from oodd_eval.metrics.cusum import Standardization
 from oodd_eval.results.directory import ResultsDirectory
-from oodd_eval.results.evaluate import must_be_of, stored_scores, unpaired_scores
+from oodd_eval.results.evaluate import cell_scores, must_be_of, stored_scores
 from oodd_eval.results.record import Record
 
 SCHEMA: Final = 1  # version of the layout; a reader refuses others
@@ -48,14 +48,7 @@ def make_curves(
                 at = thresholds(scores[TWINS], rule)
                 fitted[record.scores] = Sweep.over(scores[TWINS], rule, at), rule
             sweep, rule = fitted[record.scores]
-            if data.paired:
-                anomalous, known = scores[record.condition.part], data.anomalous(record.condition)
-                onsets, effects = (
-                    part[: len(anomalous)].tolist() for part in (known.onsets, known.effects)
-                )
-                curves = cell_curves(sweep, rule, anomalous, onsets, effects)
-            else:
-                curves = unpaired_curves(unpaired_scores(record, scores, data), sweep, rule)
+            curves = cell_curves(cell_scores(record, scores, data), sweep, rule)
             units.append({"cell": str(record.cell), **identity(record), **curves})
     return {"schema": SCHEMA, "units": units}
 

@@ -7,9 +7,8 @@ import contextlib
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from types import MappingProxyType
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,16 +19,15 @@ from oodd_eval.data.parts import CALIBRATION, TWINS, EnvironmentData, Interval, 
 from oodd_eval.data.split import Split
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import ContractError, ResultsError, UsageError
-from oodd_eval.metrics import alarms, recalibration, unpaired
+from oodd_eval.metrics import alarms, unpaired
 from oodd_eval.metrics.alarms import AlarmKind, Calibration, GuaranteedAlarm
 from oodd_eval.metrics.auc import AlarmRule, Contribution, auc_before, cell_contributions
 from oodd_eval.metrics.bootstrap import drawn_cell, mean_interval
 from oodd_eval.metrics.catalogue import HEADLINE, LEVELS, metric_info
 from oodd_eval.metrics.cusum import Standardization
-from oodd_eval.metrics.recalibration import Recalibration
+from oodd_eval.metrics.recalibration import Draws, PairedScores, Recalibration
 from oodd_eval.metrics.unpaired import UnpairedScores
-from oodd_eval.plugins.contract import Scores
-from oodd_eval.results.causality import check_before_effect, early_difference
+from oodd_eval.plugins.contract import ROLLOUT_TOLERANCE, TOLERANCE, Scores, difference
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
 from oodd_eval.results.draws import CodedDraws
 from oodd_eval.results.identity import Cell
@@ -90,70 +88,60 @@ class Rules:
 
 
 def cell_metrics(
-    anomalous: Sequence[Scores],
-    twins: Sequence[Scores],
-    onsets: Sequence[int],
-    effects: Sequence[int],
+    cell: PairedScores | UnpairedScores,
     rules: Rules,
     *,
     environment: str,
+    condition: str = "",
+    rate: float | None = None,
+    rows: bool = False,
     explained: Sequence[NDArray[np.int32]] = (),
     corrupted: Sequence[Collection[int]] = (),
     draws: Mapping[str, NDArray[np.float64]] = MappingProxyType({}),
 ) -> tuple[dict[str, Metric], dict[str, Contribution]]:
-    """Compute all metrics of one cell with their intervals; attribution where it is explained.
+    """Compute all metrics of one cell with their intervals, and their terms.
 
-    `draws` are the deviations of metrics in resamples of the calibration episodes.
+    Parameters
+    ----------
+    cell
+        The scores. The condition `NOMINAL` has nominal episodes alone, and false alarms.
+    rules
+        Made from the calibration scores.
+    environment, condition
+        What test episodes are resampled by; cells with twins share theirs, without a condition.
+    rate
+        Without twins, rows in a second; None leaves out alarms per hour.
+    rows
+        Without twins, whether metrics of rows are computed, too.
+    explained, corrupted
+        With twins, see `attribution_contributions`; none leaves these out.
+    draws
+        Deviations of metrics in resamples of the calibration episodes.
     """
-    contributions = cell_contributions(anomalous, twins, onsets, effects, rules.paper)
-    for suffix, rule in rules.guaranteed.items():
-        of_level = alarms.guaranteed_contributions(anomalous, twins, effects, rule)
-        contributions |= {f"{name}_{suffix}": c for name, c in of_level.items()}
-    if explained and (headline := rules.guaranteed.get(HEADLINE)):
-        named = alarms.attribution_contributions(anomalous, explained, corrupted, effects, headline)
-        contributions |= {f"{name}_{HEADLINE}": c for name, c in named.items()}
-    contributions = _with_deviations(contributions, draws)
-    metrics = {name: metric_of(name, c, environment) for name, c in contributions.items()}
-    return metrics | rules.thresholds(), contributions
-
-
-def unpaired_metrics(
-    cell: UnpairedScores,
-    rules: Rules,
-    *,
-    environment: str,
-    condition: Condition,
-    rate: float | None = None,
-    rows: bool = False,
-    draws: Mapping[str, NDArray[np.float64]] = MappingProxyType({}),
-) -> tuple[dict[str, Metric], dict[str, Contribution]]:
-    """Compute all metrics of one cell without twins, those of rows if asked for.
-
-    `draws` are the deviations of metrics in resamples of the calibration episodes.
-    Under the condition `NOMINAL` there are nominal episodes alone, and metrics of false alarms.
-    """
-    contributions = {} if condition == NOMINAL else unpaired.separability(cell, rules.statistic)
-    if rows:
+    levels = rules.guaranteed
+    terms: dict[str, Contribution] = {}
+    if isinstance(cell, PairedScores):
+        terms |= cell_contributions(*cell, rules.paper)
+    elif condition != str(NOMINAL):
+        terms |= unpaired.separability(cell, rules.statistic)
+    if isinstance(cell, UnpairedScores) and rows:
         # The headline, or the nearest level that is offered.
-        usual = list(rules.guaranteed)[: [*LEVELS].index(HEADLINE) + 1][-1:]
-        contributions |= unpaired.row_metrics(cell, rules.guaranteed[usual[0]] if usual else None)
-    for suffix, rule in rules.guaranteed.items():
-        of_level = unpaired.unpaired_alarms(cell, rule, rate, rules.earlier.get(suffix, ()))
-        contributions |= {f"{name}_{suffix}": c for name, c in of_level.items()}
-    contributions = _with_deviations(contributions, draws)
-    metrics = {
-        name: metric_of(name, c, environment, str(condition)) for name, c in contributions.items()
-    }
-    return metrics | rules.thresholds(), contributions
-
-
-def _with_deviations(
-    contributions: Mapping[str, Contribution], draws: Mapping[str, NDArray[np.float64]]
-) -> dict[str, Contribution]:
-    return {
-        name: replace(c, deviations=draws[name]) if name in draws else c
-        for name, c in contributions.items()
-    }
+        usual = list(levels)[: [*LEVELS].index(HEADLINE) + 1][-1:]
+        terms |= unpaired.row_metrics(cell, levels[usual[0]] if usual else None)
+    for suffix, rule in levels.items():
+        of_level = (
+            alarms.guaranteed_contributions(cell.anomalous, cell.twins, cell.effects, rule)
+            if isinstance(cell, PairedScores)
+            else unpaired.unpaired_alarms(cell, rule, rate, rules.earlier.get(suffix, ()))
+        )
+        terms |= {f"{name}_{suffix}": c for name, c in of_level.items()}
+    if isinstance(cell, PairedScores) and explained and HEADLINE in levels:
+        episodes = cell.anomalous, explained, corrupted, cell.effects
+        named = alarms.attribution_contributions(*episodes, levels[HEADLINE])
+        terms |= {f"{name}_{HEADLINE}": c for name, c in named.items()}
+    terms |= {name: replace(terms[name], deviations=draws[name]) for name in terms if name in draws}
+    metrics = {name: metric_of(name, c, environment, condition) for name, c in terms.items()}
+    return metrics | rules.thresholds(), terms
 
 
 def metric_of(
@@ -176,7 +164,7 @@ def evaluated(
     """Return the records of a unit with metrics.
 
     They are ``invalid`` where scores cannot be standardized, or tell an episode from its twin
-    before they differ (`oodd_eval.results.causality`).
+    before they differ, see `check_before_effect`.
     """
     try:
         joining = scores.parts[TWINS] if records[0].rolling else None
@@ -190,13 +178,20 @@ def evaluated(
         return _invalid(
             records, "no score of the calibration trajectories is defined, so there is no threshold"
         )
-    draws = _calibration_draws(records, scores, data)
-    measure = _with_metrics if data.paired else partial(_without_twins, rows=row_metrics)
+    cells = [cell_scores(record, scores.parts, data) for record in records]
+    draws = _calibration_draws(records[0], cells, scores, data)
     measured = [
-        measure(replace(record, calibration_draws=CodedDraws.of(of_cell)), data, scores, rules)
-        for record, of_cell in zip(records, draws, strict=True)
+        _with_metrics(
+            replace(record, calibration_draws=CodedDraws.of(of_cell)),
+            cell,
+            data,
+            scores,
+            rules,
+            rows=row_metrics,
+        )
+        for record, cell, of_cell in zip(records, cells, draws, strict=True)
     ]
-    if data.logs is None and (reason := _foresight(measured, data, scores, streamed=streamed)):
+    if data.logs is None and (reason := _foresight(measured, cells, scores, streamed=streamed)):
         return _invalid(records, reason)
     few = _too_few_to_roll(len(scores.parts[CALIBRATION]), records[0], rules)
     return [replace(r, note=few) if r.rolling else r for r in measured]
@@ -217,16 +212,15 @@ def _invalid(records: Sequence[Record], reason: str) -> list[Record]:
 
 
 def _foresight(
-    measured: Sequence[Record], data: EnvironmentData, scores: ScoreFile, *, streamed: bool
+    measured: Sequence[Record],
+    cells: Sequence[PairedScores | UnpairedScores],
+    scores: ScoreFile,
+    *,
+    streamed: bool,
 ) -> str:
     """Return how the scores of a unit tell an episode from its twin too early; empty if not."""
-    effects = {
-        record.condition.part: data.anomalous(record.condition)
-        .effects[: len(scores.parts[TWINS])]
-        .tolist()
-        for record in measured
-    }
-    first = measured[0]
+    first, pairs = measured[0], zip(measured, cells, strict=True)
+    effects = {r.condition.part: c.effects for r, c in pairs if isinstance(c, PairedScores)}
     try:
         check_before_effect(
             scores.parts,
@@ -241,26 +235,93 @@ def _foresight(
     return next(filter(None, map(early_difference, measured)), "")
 
 
+_MEANING: Final = "it uses what comes later, or what it keeps of other episodes"
+
+
+def check_before_effect(
+    parts: Mapping[str, Sequence[Scores]],
+    effects: Mapping[str, Sequence[int]],
+    *,
+    environment: str,
+    detector: str,
+    horizon: int = 1,
+    streamed: bool = False,
+) -> None:
+    """Raise `ContractError` when scores before the effect are not those of the twin.
+
+    Both episodes are equal, bit for bit, up to the effect, the first row that differs. Whoever
+    scores their rows before it differently has seen what comes after, or remembers what else was
+    scored.
+
+    Parameters
+    ----------
+    parts
+        Scores of a unit whose episodes have twins, by part.
+    effects
+        The first row of each episode that differs from its twin's, by anomalous part.
+    environment, detector
+        Names for the message.
+    horizon
+        Prediction horizon: forecasts that feed on themselves multiply what rounding leaves.
+    streamed
+        True where rows were scored one by one. Then scores agree bit for bit, else up to the
+        tolerance of batches, see `oodd_eval.plugins.contract.difference`.
+    """
+    tolerance = 0.0 if streamed else TOLERANCE if horizon == 1 else ROLLOUT_TOLERANCE
+    for part, rows in effects.items():
+        pairs = zip(parts[part], parts[TWINS], rows, strict=True)
+        for i, (scores, twin, effect) in enumerate(pairs):
+            if problem := difference(scores[:effect], twin, tolerance):
+                raise ContractError(
+                    f"detector {detector!r} is not causal: scores of {environment}/{part}[{i}] are "
+                    f"not those of its twin before t = {effect}, where they begin to differ: "
+                    f"{problem}; {_MEANING} (`oodd-eval check {detector} -k prefix`)"
+                )
+
+
+def early_difference(record: Record) -> str:
+    """Return which episode of a cell has an alarm before the effect, and its twin none; or neither.
+
+    Parameters
+    ----------
+    record
+        Of a cell with twins.
+
+    Returns
+    -------
+    str
+        One sentence about the first such episode, or a twin with the alarm; empty if none.
+    """
+    for level in LEVELS:
+        names = f"early_{level}", f"early_null_{level}"
+        if not all(name in record.per_trajectory for name in names):
+            continue
+        early, null = (record.per_trajectory[name] for name in names)
+        differs = np.flatnonzero((early != null).any(axis=0))
+        if len(differs):
+            i = int(differs[0])
+            return (
+                f"detector {record.detector!r} is not causal: {names[0]} of {record.environment}/"
+                f"{record.condition.part}[{i}] is {early[0, i]:g}, and {names[1]}, of its twin in "
+                f"the same rows, {null[0, i]:g}: {_MEANING}"
+            )
+    return ""
+
+
 def _calibration_draws(
-    records: Sequence[Record], scores: ScoreFile, data: EnvironmentData
-) -> list[recalibration.Draws]:
+    first: Record,
+    cells: Sequence[PairedScores | UnpairedScores],
+    scores: ScoreFile,
+    data: EnvironmentData,
+) -> list[Draws]:
     """Return what calibration does to the alarms of each cell of a unit.
 
     A rolling calibration is not resampled: its episodes have an order.
     """
-    first, twins = records[0], scores.parts[TWINS]
     if first.rolling:
-        return [{} for _ in records]
+        return [{} for _ in cells]
     again = Recalibration.fit(scores.parts[CALIBRATION], first.alarm, first.environment)
-    if data.paired:
-        cells = []
-        for record in records:
-            anomalous, known = scores.parts[record.condition.part], data.anomalous(record.condition)
-            starts, effects = (r[: len(anomalous)] for r in (known.onsets, known.effects))
-            cells.append(recalibration.PairedScores(anomalous, starts, effects))
-        return again.paired(twins, cells)
-    rate = data.logs.rate if data.logs else None
-    return [again.unpaired(unpaired_scores(r, scores.parts, data), rate) for r in records]
+    return again.of_cells(cells, data.logs.rate if data.logs else None)
 
 
 def _too_few_to_roll(episodes: int, record: Record, rules: Rules) -> str:
@@ -284,37 +345,37 @@ def counts_of(data: EnvironmentData, condition: Condition, limit: int | None) ->
     return counts if data.paired else {**counts, "test": counts.get("test", 0)}
 
 
-def _with_metrics(record: Record, data: EnvironmentData, scores: ScoreFile, rules: Rules) -> Record:
-    anomalous, known = scores.parts[record.condition.part], data.anomalous(record.condition)
-    twins = scores.parts[TWINS]
-    starts, effects = (r[: len(anomalous)].tolist() for r in (known.onsets, known.effects))
+def _with_metrics(
+    record: Record,
+    cell: PairedScores | UnpairedScores,
+    data: EnvironmentData,
+    scores: ScoreFile,
+    rules: Rules,
+    *,
+    rows: bool,
+) -> Record:
+    settings: dict[str, Any] = {
+        "environment": record.environment,
+        "draws": record.calibration_draws,
+        "rate": data.logs.rate if data.logs else None,
+    }
+    if isinstance(cell, UnpairedScores):
+        condition = str(record.condition)
+        metrics, terms = cell_metrics(cell, rules, condition=condition, rows=rows, **settings)
+        return replace(record, metrics=metrics, per_trajectory=_terms(terms))
+    known, note = data.anomalous(record.condition), ""
     explained = scores.explained.get(record.condition.part, [])
-    metrics, contributions = cell_metrics(
-        anomalous,
-        twins,
-        starts,
-        effects,
-        rules,
-        environment=record.environment,
-        explained=explained,
-        corrupted=[p.get("sensors", ()) for p in known.parameters] if explained else (),
-        draws=record.calibration_draws,
-    )
-    note = ""
+    corrupted = [p.get("sensors", ()) for p in known.parameters] if explained else ()
+    metrics, terms = cell_metrics(cell, rules, explained=explained, corrupted=corrupted, **settings)
     if data.logs is not None:
-        before = auc_before(anomalous, twins, starts)
-        contributions["auc_before"] = before
+        before = auc_before(*cell[:3])
+        terms["auc_before"] = before
         metrics["auc_before"] = metric_of("auc_before", before, record.environment)
         if note := _distrusted(before.value):
             for name in NEED_TWINS:
-                del metrics[name], contributions[name]
-    return replace(
-        record,
-        metrics=metrics,
-        per_trajectory=_terms(contributions),
-        brief=bool(known.brief),
-        note=note,
-    )
+                del metrics[name], terms[name]
+    brief = bool(known.brief)
+    return replace(record, metrics=metrics, per_trajectory=_terms(terms), brief=brief, note=note)
 
 
 LIKE: Final = (0.4, 0.6)
@@ -335,10 +396,10 @@ def _distrusted(before: float) -> str:
     )
 
 
-def unpaired_scores(
+def cell_scores(
     record: Record, parts: Mapping[str, Sequence[Scores]], data: EnvironmentData
-) -> UnpairedScores:
-    """Return the scores of a cell without twins, with what is known of its episodes.
+) -> PairedScores | UnpairedScores:
+    """Return the scores of a cell with what is known of its episodes.
 
     Parameters
     ----------
@@ -350,27 +411,16 @@ def unpaired_scores(
         The environment.
     """
     nominal, facts = parts[TWINS], data.logs or LogFacts()
+    if data.paired:
+        anomalous, twins_of = parts[record.condition.part], data.anomalous(record.condition)
+        rows = (rows[: len(anomalous)].tolist() for rows in (twins_of.onsets, twins_of.effects))
+        return PairedScores(anomalous, nominal, *rows)
     cell = UnpairedScores(nominal, [], [], data.twins.tasks[: len(nominal)], [], facts.clock)
     if record.condition == NOMINAL:
         return cell
     anomalous, known = parts[record.condition.part], data.labelled(record.condition)
     n = len(anomalous)
     return replace(cell, anomalous=anomalous, intervals=known.intervals[:n], tasks=known.tasks[:n])
-
-
-def _without_twins(
-    record: Record, data: EnvironmentData, scores: ScoreFile, rules: Rules, *, rows: bool
-) -> Record:
-    metrics, contributions = unpaired_metrics(
-        unpaired_scores(record, scores.parts, data),
-        rules,
-        environment=record.environment,
-        condition=record.condition,
-        rate=data.logs.rate if data.logs else None,
-        rows=rows,
-        draws=record.calibration_draws,
-    )
-    return replace(record, metrics=metrics, per_trajectory=_terms(contributions))
 
 
 def _terms(contributions: Mapping[str, Contribution]) -> dict[str, NDArray[np.float64]]:

@@ -10,13 +10,13 @@ from typing import Any, Final, Literal
 
 from oodd_eval.metrics.catalogue import HEADLINE, LEVELS, METRICS, NAMES, UNDEFINED, metric_info
 from oodd_eval.names import counted
-from oodd_eval.results import strengths, tables
+from oodd_eval.results import tables
 from oodd_eval.results.board import Board, boards, grouped
 from oodd_eval.results.compare import MEANINGS, By, Comparison, Difference
 from oodd_eval.results.record import Record
 from oodd_eval.results.standings import verdict_of
-from oodd_eval.results.strengths import thresholds
-from oodd_eval.results.tables import Table
+from oodd_eval.results.strengths import StrengthTables, thresholds
+from oodd_eval.results.tables import Table, Tables
 
 Detail = Literal["brief", "wide", "full"]
 
@@ -122,31 +122,25 @@ class Report:
         )
 
     def _tables(self, board: Board) -> Iterator[Table | None]:
-        intervals, full = self.intervals, self.detail == "full"
+        means, full = Tables(board, self.intervals, level=self.level), self.detail == "full"
         ranked = not board.leaves_out([board.ranking])
-        if board.paired:
-            if ranked:
-                yield tables.separability(board, intervals=intervals)
-            yield tables.guaranteed(board, self.level, intervals=intervals)
+        if not board.paired:
+            yield from means.of_logs(whole=self.detail != "brief")
         else:
-            whole = self.detail != "brief"
-            yield from tables.of_logs(board, intervals=intervals, level=self.level, whole=whole)
-        yield tables.attribution(board, intervals=intervals)
-        yield from strengths.strength_tables(
-            board, intervals=intervals, places=full, units=self.units
-        )
+            yield means.separability() if ranked else None
+            yield means.guaranteed()
+        yield means.attribution()
+        yield from StrengthTables(board, self.intervals, self.units).overview(places=full)
         if self.detail != "brief":
-            if not board.leaves_out(_WITHOUT_ALARM):
-                yield tables.all_metrics(board, intervals=intervals)
-            yield from tables.all_alarms(board, intervals=intervals)
+            yield None if board.leaves_out(_WITHOUT_ALARM) else means.all_metrics()
+            yield from means.all_alarms()
         if board.paired and (full or self.paper):
-            if not board.leaves_out(_OF_PAPER):
-                yield tables.papers(board, intervals=intervals)
-            yield from tables.anomaly_groups(board, intervals=intervals)
+            yield None if board.leaves_out(_OF_PAPER) else means.papers()
+            yield from means.anomaly_groups()
         if full:
             # One figure stands above.
             if ranked and len(board.environments) * len(board.anomalies) > 1:
-                yield from (tables.by_anomaly(board, e, intervals=intervals) for e in board.entries)
+                yield from map(means.by_anomaly, board.entries)
             yield tables.failures(board)
 
     def _of_detector(self, board: Board) -> Section:
@@ -165,12 +159,11 @@ class Report:
 
     def _tables_of_detector(self, board: Board) -> Iterator[Table]:
         for entry in (e for e in board.entries if e.detector == self.detector):
-            yield tables.by_anomaly(board, entry, self.metric, intervals=self.intervals)
+            yield Tables(board, self.intervals).by_anomaly(entry, self.metric)
             by_row = thresholds([r for r in board.records if r.setting == entry])
             if by_row.get(entry):
-                yield strengths.by_place(
-                    board, entry, by_row, intervals=self.intervals, units=self.units
-                )
+                of_board = StrengthTables(board, self.intervals, self.units)
+                yield of_board.by_place(entry, by_row[entry])
 
 
 def findings_of(board: Board, level: str = "") -> list[str]:

@@ -4,9 +4,10 @@ A *pair* is an environment and a kind of anomaly. Its strengths are those at whi
 records that say their number, or whose strength is a rung of the benchmark's ladder.
 """
 
+import functools
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
@@ -18,7 +19,7 @@ from oodd_eval.errors import SplitError, UnknownNameError
 from oodd_eval.metrics.bootstrap import mean_over_cells, nan_mean
 from oodd_eval.metrics.catalogue import FOUND_WITHIN, HEADLINE, UNDEFINED, metric_info
 from oodd_eval.metrics.threshold import DetectionThreshold, MeanThreshold, geometric_mean
-from oodd_eval.results.board import Board
+from oodd_eval.results.board import Board, Column
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
 from oodd_eval.results.tables import Table, show_value, unranked
@@ -277,140 +278,138 @@ COSTS: Final = MappingProxyType(
 NO_UNITS: Final[Mapping[str, str]] = MappingProxyType({})
 
 
-def strength_tables(
-    board: Board,
-    *,
-    intervals: bool = False,
-    places: bool = False,
-    units: Mapping[str, str] = NO_UNITS,
-) -> list[Table]:
-    """Return all tables of a board's records at strengths; none where it has no such records.
+@dataclass(frozen=True)
+class StrengthTables:
+    """The tables of a board's records at strengths.
 
-    With `intervals`, means by kind and thresholds of single places have their 95 % intervals. With
-    `places`, each row has a table with its threshold in every environment. Where `units` has the
-    unit of a kind, it stands in the kind's heading.
+    Attributes
+    ----------
+    board
+        The board.
+    intervals
+        Whether means by kind and thresholds of single places have their 95 % intervals.
+    units
+        Units of kinds of anomalies, for the headings of those that have one here.
     """
-    by_row = thresholds(board.records)
-    strengths = Strengths.of(board.records)
-    if not board.paired:  # episodes of two strengths have nothing in common
-        return [_separability(board, board.entries, strengths)] if strengths.names else []
-    order = [entry for entry in board.entries if entry in by_row]
-    ranked = by_row and not board.leaves_out([board.ranking])
-    separability = [_separability(board, order, strengths)] if ranked else []
-    if not any(by_row.values()):  # no level of 5 %, with few calibration episodes
-        return separability
-    by_kind = _by_kind(board, by_row, strengths, intervals=intervals, units=units)
-    rows = [e for e in board.entries if places and by_row.get(e)]
-    single = [by_place(board, e, by_row, intervals=intervals, units=units) for e in rows]
-    return [overview(board, by_row), *separability, by_kind, *single]
 
+    board: Board
+    intervals: bool = False
+    units: Mapping[str, str] = field(default_factory=dict)
 
-def by_place(
-    board: Board,
-    entry: Setting,
-    by_row: Thresholds,
-    *,
-    intervals: bool = False,
-    units: Mapping[str, str] = NO_UNITS,
-) -> Table:
-    """Return one row's thresholds by environment and kind of anomaly, in the anomaly's unit."""
-    by_pair = by_row[entry]
-    kinds = [k for k in board.anomalies if any(k == kind for _, kind in by_pair)]
-    rows = [
-        [title_of(e), *(_single(by_pair.get((e, k)), intervals=intervals) for k in kinds)]
-        for e in board.environments
-    ]
-    title = f"{entry}: detection thresholds by anomaly, each in its own unit"
-    note = f"{_RULE} ≤ and > mark thresholds beyond the weakest and the strongest rung."
-    return Table(title, ["Environment", *_with_units(kinds, units)], rows, note=note)
+    @functools.cached_property
+    def strengths(self) -> Strengths:
+        """The strengths of the records."""
+        return Strengths.of(self.board.records)
 
+    @functools.cached_property
+    def by_row(self) -> Thresholds:
+        """The thresholds of the records."""
+        return thresholds(self.board.records)
 
-def overview(board: Board, by_row: Thresholds) -> Table:
-    """Return relative thresholds and shares found by strength, the lowest threshold first.
+    def overview(self, *, places: bool = False) -> list[Table]:
+        """Return all tables; none without records at strengths.
 
-    `by_row` are the thresholds of the board's records.
-    """
-    strengths = Strengths.of(board.records)
-    reference = by_row.get(REFERENCE, {})
-    means = {entry: _mean(by_pair, reference, strengths) for entry, by_pair in by_row.items()}
-    values = {entry: mean.value if mean else math.inf for entry, mean in means.items()}
-    order = sorted(values, key=values.__getitem__)
-    most = max((mean.pairs for mean in means.values() if mean), default=0)
-    shares = _by_strength(board, order, strengths, DETECTION)
-    rows = []
-    for entry in order:
-        mean = means[entry]
-        figures = [UNDEFINED, 0, "", ""]
-        if mean:
-            text = mean.text() + "*" * (mean.pairs < most)
-            figures = [text, mean.pairs, mean.below, mean.above]
-        rows.append([str(entry), *map(str, figures), *shares[entry]])
-    over = "in the units of the anomalies"
-    if strengths.calibrated:
-        over = f"as a multiple of the strength that {COSTS[strengths.base]}"
-    if reference:
-        over = f"as a multiple of {REFERENCE}'s"
-    header = ["detector", "threshold", "pairs", "below", "above", *strengths.names]
-    note = (
-        f"{_RULE} Shown is its geometric mean {over}, over pairs of environment and "
-        "anomaly, with its 95 % interval. In so many pairs it lies below or above the ladder, and "
-        f"counts as the end of the ladder. {_SIDES} {_COLUMNS[strengths.base]} {unranked(board)}"
-    ).rstrip()
-    title = "Detection thresholds, lower is better, and share of episodes found by strength (%)"
-    return Table(title, header, rows, note=note)
+        With `places`, each row has a table with its threshold in every environment.
+        """
+        board, by_row = self.board, self.by_row
+        if not board.paired:  # episodes of two strengths have nothing in common
+            return [self.separability(board.entries)] if self.strengths.names else []
+        ranked = by_row and not board.leaves_out([board.ranking])
+        order = [entry for entry in board.entries if entry in by_row]
+        tables = [self.separability(order)] if ranked else []
+        if any(by_row.values()):  # else no level of 5 %, with few calibration episodes
+            single = [self.by_place(e, by_row[e]) for e in order if places and by_row[e]]
+            tables = [self.relative(), *tables, self.by_kind(order), *single]
+        return tables
 
+    def by_place(self, entry: Setting, by_pair: Mapping[Pair, DetectionThreshold]) -> Table:
+        """Return one row's thresholds by environment and kind of anomaly, in the anomaly's unit."""
+        kinds = self._kinds(by_pair)
 
-def _separability(board: Board, order: list[Setting], strengths: Strengths) -> Table:
-    """Return the metric that ranks by strength."""
-    texts = _by_strength(board, order, strengths, board.ranking)
-    rows = [[str(e), *texts[e]] for e in order]
-    header, note = ["detector", *strengths.names], _COLUMNS[strengths.base]
-    title = metric_info(board.ranking).title
-    return Table(f"{title[0].upper()}{title[1:]} (%) by strength", header, rows, note=note)
+        def text(threshold: DetectionThreshold | None) -> str:
+            if threshold is None:
+                return ""
+            ends = ", ".join(map(threshold.text, threshold.interval))
+            return threshold.text(threshold.value) + f" [{ends}]" * self.intervals
 
+        rows = [
+            [title_of(e), *(text(by_pair.get((e, kind))) for kind in kinds)]
+            for e in self.board.environments
+        ]
+        title = f"{entry}: detection thresholds by anomaly, each in its own unit"
+        note = f"{_RULE} ≤ and > mark thresholds beyond the weakest and the strongest rung."
+        return Table(title, ["Environment", *map(self._with_unit, kinds)], rows, note=note)
 
-def _by_kind(
-    board: Board,
-    by_row: Thresholds,
-    strengths: Strengths,
-    *,
-    intervals: bool,
-    units: Mapping[str, str],
-) -> Table:
-    """Return thresholds by kind of anomaly, means over environments."""
-    kinds = [k for k in board.anomalies if any(k == kind for p in by_row.values() for _, kind in p)]
-    rows = []
-    for entry in (e for e in board.entries if e in by_row):
-        of_kind = ({p: t for p, t in by_row[entry].items() if p[1] == k} for k in kinds)
-        means = (_mean(by_pair, {}, strengths) for by_pair in of_kind)
-        texts = (mean.text(interval=intervals) if mean else "" for mean in means)
-        rows.append([str(entry), *texts])
-    over = "each in its own unit"
-    if strengths.calibrated:
-        over = f"in units of the strength that {COSTS[strengths.base]}"
-    title = f"Detection thresholds by anomaly, {over}"
-    note = (
-        f"{_RULE} Means are geometric, over environments; a threshold beyond the ladder counts as "
-        f"its end. {_SIDES}"
-    )
-    # Calibrated thresholds are multiples of the strength that is the unit.
-    titles = kinds if strengths.calibrated else _with_units(kinds, units)
-    return Table(title, ["detector", *titles], rows, note=note)
+    def relative(self) -> Table:
+        """Return relative thresholds and shares found by strength, the lowest threshold first."""
+        strengths, reference = self.strengths, self.by_row.get(REFERENCE, {})
+        means = {e: _mean(by_pair, reference, strengths) for e, by_pair in self.by_row.items()}
+        order = sorted(means, key=lambda e: mean.value if (mean := means[e]) else math.inf)
+        most = max((mean.pairs for mean in means.values() if mean), default=0)
+        shares = self._by_strength(order, DETECTION)
+        rows = []
+        for entry in order:
+            figures: tuple[object, ...] = (UNDEFINED, 0, "", "")
+            if mean := means[entry]:
+                text = mean.text() + "*" * (mean.pairs < most)
+                figures = text, mean.pairs, mean.below, mean.above
+            rows.append([str(entry), *map(str, figures), *shares[entry]])
+        over = "in the units of the anomalies"
+        if strengths.calibrated:
+            over = f"as a multiple of the strength that {COSTS[strengths.base]}"
+        if reference:
+            over = f"as a multiple of {REFERENCE}'s"
+        header = ["detector", "threshold", "pairs", "below", "above", *strengths.names]
+        note = (
+            f"{_RULE} Shown is its geometric mean {over}, over pairs of environment and anomaly, "
+            "with its 95 % interval. In so many pairs it lies below or above the ladder, and "
+            f"counts as the end of the ladder. {_SIDES} {_COLUMNS[strengths.base]} "
+            f"{unranked(self.board)}"
+        ).rstrip()
+        title = "Detection thresholds, lower is better, and share of episodes found by strength (%)"
+        return Table(title, header, rows, note=note)
 
+    def separability(self, order: Sequence[Setting]) -> Table:
+        """Return the metric that ranks by strength."""
+        texts = self._by_strength(order, self.board.ranking)
+        title = metric_info(self.board.ranking).title
+        rows = [[str(e), *texts[e]] for e in order]
+        header, note = ["detector", *self.strengths.names], _COLUMNS[self.strengths.base]
+        return Table(f"{title[0].upper()}{title[1:]} (%) by strength", header, rows, note=note)
 
-def _with_units(kinds: Iterable[str], units: Mapping[str, str]) -> list[str]:
-    return [f"{kind} ({units[kind]})" if kind in units else kind for kind in kinds]
+    def by_kind(self, order: Sequence[Setting]) -> Table:
+        """Return thresholds by kind of anomaly, means over environments."""
+        kinds = self._kinds(pair for by_pair in self.by_row.values() for pair in by_pair)
+        rows = []
+        for entry in order:
+            of_kind = ({p: t for p, t in self.by_row[entry].items() if p[1] == k} for k in kinds)
+            means = (_mean(by_pair, {}, self.strengths) for by_pair in of_kind)
+            texts = (mean.text(interval=self.intervals) if mean else "" for mean in means)
+            rows.append([str(entry), *texts])
+        over, titles = "each in its own unit", [*map(self._with_unit, kinds)]
+        if self.strengths.calibrated:  # thresholds are multiples of the strength that is the unit
+            over, titles = f"in units of the strength that {COSTS[self.strengths.base]}", kinds
+        note = (
+            f"{_RULE} Means are geometric, over environments; a threshold beyond the ladder counts "
+            f"as its end. {_SIDES}"
+        )
+        title = f"Detection thresholds by anomaly, {over}"
+        return Table(title, ["detector", *titles], rows, note=note)
 
+    def _kinds(self, pairs: Iterable[Pair]) -> list[str]:
+        known = {kind for _, kind in pairs}
+        return [kind for kind in self.board.anomalies if kind in known]
 
-def _by_strength(
-    board: Board, entries: list[Setting], strengths: Strengths, metric: str
-) -> dict[Setting, list[str]]:
-    """Return a metric's means at each strength as texts."""
-    steps = [Board(strengths.at(board.records, name)) for name in strengths.names]
-    return {
-        e: [show_value(b.mean(e, b.environments, b.anomalies, metric), metric) for b in steps]
-        for e in entries
-    }
+    def _with_unit(self, kind: str) -> str:
+        return f"{kind} ({self.units[kind]})" if kind in self.units else kind
+
+    def _by_strength(self, entries: Iterable[Setting], metric: str) -> dict[Setting, list[str]]:
+        """Return a metric's means at each strength as texts."""
+        records, names = self.board.records, self.strengths.names
+        steps = [Board(self.strengths.at(records, name)) for name in names]
+        return {
+            e: [show_value(board.of(e, Column(metric)), metric) for board in steps] for e in entries
+        }
 
 
 def _mean(
@@ -422,10 +421,3 @@ def _mean(
     chosen = [p for p in by_pair if p in reference] if reference else [*by_pair]
     units = [reference[p] if reference else strengths.unit(p) for p in chosen]
     return geometric_mean([by_pair[p] for p in chosen], units) if chosen else None
-
-
-def _single(threshold: DetectionThreshold | None, *, intervals: bool) -> str:
-    if threshold is None:
-        return ""
-    ends = ", ".join(map(threshold.text, threshold.interval))
-    return threshold.text(threshold.value) + f" [{ends}]" * intervals

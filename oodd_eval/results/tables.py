@@ -145,49 +145,287 @@ ROWS: Final = tuple(name for name, info in catalogue.METRICS.items() if info.req
 _LABELS: Final = ("rank", "detector", "settings")
 
 
-def over_all(
-    board: Board, names: Iterable[str], intervals: Collection[str] = (), *, short: bool = False
-) -> list[Column]:
-    """Return columns of means over all cells; `short` where a heading names alarm or level."""
-    infos = map(metric_info, board.present(names))
-    return [
-        Column(i.name, i.noun if short else i.title, intervals=i.name in intervals) for i in infos
-    ]
+@dataclass(frozen=True)
+class Tables:
+    """The tables of means of a board: each is a list of columns, and leaves out what no record has.
 
-
-def separability(board: Board, *, intervals: bool = False) -> Table:
-    """Return matched AUC by anomaly group and by environment, the best mean first.
-
-    Beside the mean over all cells stand that of smoothed scores and that against another twin,
-    where records have them.
+    Attributes
+    ----------
+    board
+        The board.
+    intervals
+        Whether means have their 95 % intervals; false episodes always have.
+    standings
+        Where there are some, rows are in their order and have their places.
+    level
+        Suffix of the level of guaranteed alarms, by default the board's, or the strictest that
+        its records have.
     """
-    beside = {name.removeprefix("auc_"): name for name in board.present(_BESIDE_MATCHED)}
-    columns = _by_group(board, "mean") + [Column(name, title) for title, name in beside.items()]
-    columns += [Column(board.ranking, name, [name]) for name in board.environments]
-    columns = [column._replace(intervals=intervals) for column in columns]
-    title = "Separability: matched AUC (%), higher is better. The leaderboard ranks by this."
-    note = _joined(explained(beside), unranked(board))
-    return by_metric(board, title, columns, note=note, entries=best_first(board))
+
+    board: Board
+    intervals: bool = False
+    standings: Sequence[Standing] = ()
+    level: str = ""
+
+    def separability(self) -> Table:
+        """Return matched AUC by anomaly group and by environment, the best mean first.
+
+        Beside the mean over all cells stand that of smoothed scores and that against another twin,
+        where records have them.
+        """
+        board = self.board
+        beside = {name.removeprefix("auc_"): name for name in board.present(_BESIDE_MATCHED)}
+        columns = by_group(board, "mean") + [Column(name, title) for title, name in beside.items()]
+        columns += [Column(board.ranking, name, [name]) for name in board.environments]
+        title = "Separability: matched AUC (%), higher is better. The leaderboard ranks by this."
+        note = _joined(explained(beside), unranked(board))
+        return self.table(title, self._with_ends(columns), note, best_first(board))
+
+    def guaranteed(self, *, nulls: bool = False) -> Table | None:
+        """Return guaranteed alarms at a level, mean over cells; None when no record has them.
+
+        With `nulls` each figure stands beside what false alarms alone give.
+        """
+        levels = self.board.present(f"false_episodes_{level}" for level in catalogue.LEVELS)
+        usual = f"false_episodes_{catalogue.HEADLINE}"
+        strictest = usual if usual in levels or not levels else levels[-1]
+        asked = self.level or catalogue.HEADLINE
+        suffix = self.level or strictest.removeprefix("false_episodes_")
+        bases = catalogue.GUARANTEED if nulls else _ALARMS
+        columns = self.columns(f"{name}_{suffix}" for name in bases)
+        if not columns:
+            return None
+        names = [column.metric for column in columns]
+        hours = f"false_alarms_per_hour_{suffix}"
+        hourly = f"{metric_info(hours).noun}, " * (hours in names)
+        steps = "delays in steps, " * any(name.startswith("delay") for name in names)
+        units = f"{steps}{hourly}the rest in %" if steps or hourly else "%"
+        episodes = "nominal twins" if self.board.paired else "nominal test episodes"
+        note = _joined(
+            f"The threshold promises an alarm in at most {percent_of(suffix)} of nominal episodes; "
+            f"false episodes is the share of this split's {episodes} that raised one.",
+            CENSORED * (f"delay_censored_{suffix}" in names),
+            *(lowered_level(self.board, asked, suffix) if asked != suffix else ()),
+        )
+        return self.table(f"Guaranteed alarms at {percent_of(suffix)} ({units})", columns, note)
+
+    def papers(self) -> Table:
+        """Return what the paper's alarm does, mean over cells, under a heading of its own."""
+        columns = self.columns(_PAPER)
+        note = explained({c.title: c.metric for c in columns if c.metric in _PAPERS_NULLS})
+        return self.table(f"{PAPER} (delays in steps, the rest as shares)", columns, note)
+
+    def attribution(self) -> Table | None:
+        """Return what detectors that explain say at their guaranteed alarms; None without any."""
+        names = {*catalogue.ATTRIBUTION}
+        records = [r for r in self.board.records if r.metrics.keys() & names]
+        if not records:
+            return None
+        explaining = {r.setting for r in records}
+        ranks = [standing for standing in self.standings if standing.entry in explaining]
+        kept = [r for r in self.board.records if r.setting in explaining]
+        of_rows = replace(self, board=self.board if ranks else Board(kept), standings=ranks)
+        columns, level = of_rows.columns(catalogue.ATTRIBUTION), metric_info(min(names)).level
+        title = f"Attribution at {level} (onset error in rows, the rest in %)"
+        return of_rows.table(title, columns, _ATTRIBUTION)
+
+    def all_metrics(self) -> Table:
+        """Return every metric without an alarm, mean over all cells, with nulls and the placebo."""
+        usual = [n for n, info in catalogue.METRICS.items() if info.cells != "unpaired"]
+        infos = map(metric_info, self.board.present(catalogue.METRICS) or usual)
+        shown = [info for info in infos if not info.request and not info.paper]
+        columns = [Column(info.name, info.title, intervals=self.intervals) for info in shown]
+        return self.table("All metrics of separability (%), mean over cells", columns)
+
+    def all_alarms(self) -> list[Table]:
+        """Return guaranteed alarms at every level that records have, with their nulls."""
+        levels = (replace(self, level=suffix) for suffix in catalogue.LEVELS)
+        return [table for of in levels if (table := of.guaranteed(nulls=True))]
+
+    def anomaly_groups(self) -> list[Table]:
+        """Return AUC, delay and false-alarm rate by environment: the paper's Table 5.
+
+        There is a table for each horizon and group of anomalies, none where records lack all three.
+        """
+        groups = [*filter(self.board.in_group, GROUPS)] if self.board.present(_TABLE_5) else []
+        return [self._anomaly_group(h, g) for h in self.board.horizons for g in groups]
+
+    def _anomaly_group(self, horizon: int, group: str) -> Table:
+        """Return one of them; AVG is over detectors, without trivial rows if there are others."""
+        board = self.board
+        entries = [e for e in board.entries if e.horizon == horizon]
+        averaged = [e for e in entries if not board.is_trivial(e)] or entries
+        rows = []
+        for environment, metric in itertools.product(board.environments, _TABLE_5):
+            column = Column(metric, "", [environment], board.in_group(group), self.intervals)
+            means = {e: board.of(e, column) for e in entries}
+            partial = any(means[e].state or means[e].partial for e in averaged)
+            average = Value(nan_mean(means[e].value for e in averaged), cells=1, partial=partial)
+            labels = [title_of(environment), metric_info(metric).short]
+            rows.append([*labels, *(show_value(v, metric) for v in (*means.values(), average))])
+        title = f"{PAPER}. AUC (%), delay (steps), false-alarm rate (FAR), {group}, Δ = {horizon}"
+        # The title says the horizon.
+        header = ["Environment", "Result", *(str(replace(e, horizon=1)) for e in entries), "AVG"]
+        left_out = ", ".join(str(e) for e in entries if e not in averaged)
+        note = f"AVG is the mean without the trivial rows: {left_out}." if left_out else ""
+        table = Table(title, header, rows, labels=2, note=note)
+        if len(board.environments) > 1:
+            return table
+        title += f", {title_of(board.environments[0])}"
+        return replace(table.columns(range(1, len(header))), title=title, labels=1)
+
+    def by_anomaly(self, entry: Setting, metric: str = "") -> Table:
+        """Return one detector's metric by environment and anomaly, by default that which ranks."""
+        board, info = self.board, metric_info(metric or self.board.ranking)
+        cells = {
+            e: [Column(info.name, a, [e], [a], self.intervals) for a in board.anomalies]
+            for e in board.environments
+        }
+        rows = [[title_of(e), *texts(board, entry, columns)] for e, columns in cells.items()]
+        note = " ".join(reasons(board, [entry], itertools.chain(*cells.values())))
+        title = f"{entry}: {info.title}{' (%)' * (info.unit == 'percent')} by anomaly"
+        header = ["Environment", *board.anomalies]
+        return Table(title, header, rows, note=note, wrap=not board.paired)
+
+    def of_logs(self, *, whole: bool = False) -> list[Table]:
+        """Return the tables of a board without twins, the most important one first.
+
+        With `whole` each of several environments has a headline of its own, too.
+        """
+        environments = self.board.environments
+        single = environments if whole and len(environments) > 1 else []
+        candidates = [self._headline(), self._outcomes(), self._nominal(), self._apart()]
+        candidates += [self._headline([name]) for name in single]
+        if self._present(ROWS):
+            candidates.append(self._of_logs(_OF_ROWS, ROWS))
+        return [table for table in candidates if table]
+
+    def _headline(self, environments: Sequence[str] = ()) -> Table | None:
+        """Return separability and guaranteed alarms side by side; None without anomalous rows."""
+        alarms = self._at_level(*_ALARMS_OF_LOGS)
+        if not self._present((POOLED[-1], alarms[0]), environments):
+            return None
+        title = "Separability (%, higher is better)"
+        title += " and guaranteed alarms" * bool(self._present(alarms, environments))
+        note = CENSORED if self._present(self._at_level("delay_censored")) else ""
+        if not environments:
+            first = {_heading(name): name for name in self._present((*POOLED[:2], alarms[0]))}
+            note = _joined(explained(first), note)
+        return self._of_logs(title, (*POOLED, *alarms), environments, note)
+
+    def _outcomes(self) -> Table | None:
+        """Return what is found of episodes known by their outcome alone; None without any."""
+        if not self._present(["auc_outcome"]):
+            return None
+        names = ["auc_outcome", *self._at_level("found_outcome", "found_outcome_null")]
+        if self._headline() is None:
+            names += [*POOLED, *self._at_level(*_NOMINAL)]
+        note = "Episodes are compared up to the same row, as failures run into the time limit."
+        if all(entry.detector != CLOCK for entry in self.board.entries):
+            note += (
+                f" Add the row {CLOCK} (--detector ...,{CLOCK}) to see how much of this the phase "
+                "of the episode alone gives."
+            )
+        return self._of_logs("Episodes known by their outcome alone (%)", names, note=note)
+
+    def _nominal(self) -> Table | None:
+        """Return alarms in the environments that have nominal test episodes alone; else None."""
+        names, judged = self._at_level(*_NOMINAL), (*POOLED, "auc_outcome")
+        alone = [e for e in self.board.environments if not self._present(judged, [e])]
+        if not alone or not self._present(names, alone):
+            return None
+        some = alone if alone != self.board.environments else ()
+        return self._of_logs("Alarms on nominal test episodes alone", names, some)
+
+    def _apart(self) -> Table | None:
+        """Return the metric that ranks by environment and group; None where there is only one."""
+        board, metric = self.board, self.board.ranking
+        compared = [e for e in board.environments if self._present([metric], [e])]
+        places = [Column(metric, e, [e]) for e in compared] if len(compared) > 1 else []
+        columns = self._with_ends([*places, *by_group(board, "")[1:]])
+        if not columns or not compared:
+            return None
+        by = " and ".join(["environment"] * bool(places) + ["group"] * bool(board.groups))
+        title = metric_info(metric).title
+        entries = self._entries
+        table = self.table(f"{title[0].upper()}{title[1:]} (%) by {by}", columns, "", entries)
+        if places:
+            means = [show_value(_mean(board, entry, places), metric) for entry in entries]
+            for row, text in zip((table.header, *table.rows), ("mean", *means), strict=True):
+                row.insert(table.labels, text)
+            table = replace(table, note="The mean is that of the environments, each counting once.")
+        return table
+
+    def _of_logs(
+        self, title: str, names: Iterable[str], environments: Sequence[str] = (), note: str = ""
+    ) -> Table:
+        """Return means of the metrics that the board has."""
+        suffix, columns = self.level or self.board.level, []
+        for info in map(metric_info, self._present(names, environments)):
+            text = _heading(info.name) + " (steps)" * (info.unit == "steps")
+            text += f" (≤ {percent_of(suffix)})" * info.name.startswith("false_episodes")
+            columns.append(Column(info.name, text, environments))
+        title += f" at {percent_of(suffix)}" * any(metric_info(c.metric).level for c in columns)
+        title += f": {', '.join(environments)}" * bool(environments)
+        asked = self.level or catalogue.HEADLINE
+        if f"false_episodes_{asked}" not in [c.metric for c in columns]:
+            note = _joined(note, *lowered_level(self.board, asked, suffix))
+        return self.table(title, self._with_ends(columns), note, self._entries)
+
+    @property
+    def _entries(self) -> list[Setting]:
+        return [row.entry for row in self.standings] or best_first(self.board)
+
+    def _at_level(self, *names: str) -> list[str]:
+        return [f"{name}_{self.level or self.board.level}" for name in names]
+
+    def _present(self, names: Iterable[str], environments: Sequence[str] = ()) -> list[str]:
+        """Return the metrics that any record has a value of, of some environments or of all."""
+        records = self.board.records
+        chosen = [r for r in records if not environments or r.environment in environments]
+        return [name for name in names if cells_with(name, chosen)]
+
+    def columns(self, names: Iterable[str]) -> list[Column]:
+        """Return means over all cells, under headings that name no alarm and no level."""
+        present = self.board.present(names)
+        return self._with_ends([Column(name, metric_info(name).noun) for name in present])
+
+    def _with_ends(self, columns: Iterable[Column]) -> list[Column]:
+        """Return columns with intervals where all have them, or where they are exact."""
+        exact = {c.metric for c in columns if metric_info(c.metric).interval == "exact"}
+        return [c._replace(intervals=self.intervals or c.metric in exact) for c in columns]
+
+    def table(
+        self, title: str, columns: Sequence[Column], note: str = "", entries: Sequence[Setting] = ()
+    ) -> Table:
+        """Return columns with a row per detector, or per standing with its place."""
+        labels = {row.entry: _labels(row) for row in self.standings}
+        labels = labels or {e: [str(e)] for e in entries or self.board.entries}
+        rows = [[*label, *texts(self.board, entry, columns)] for entry, label in labels.items()]
+        first = _LABELS if self.standings else ("detector",)
+        header = [*first, *(c.title for c in columns)]
+        note = _joined(note, *reasons(self.board, labels, columns))
+        return Table(title, header, rows, len(first), note, wrap=not self.board.paired)
 
 
 _BESIDE_MATCHED: Final = ("auc_smoothed", "auc_unpaired")
+_TABLE_5: Final = ("auc", "delay", "far")
+_NOMINAL: Final = ("false_episodes", "false_alarms_per_hour")
+_OF_ROWS: Final = "Metrics of rows, for comparison with published tables; they rank nothing"
+_ATTRIBUTION: Final = (
+    "Of the detectors that explain their scores, at the first guaranteed alarm: how often the "
+    "sensor that they name first is a corrupted one, over sensor anomalies, and how far the onset "
+    "that they name is from the effect, the median of a cell."
+)
+
+CENSORED: Final = "Delay censored counts a miss as the whole remainder of its episode."
+"""Sentence below each table with the delay that ranks."""
 
 
-def _by_group(board: Board, title: str) -> list[Column]:
+def by_group(board: Board, title: str) -> list[Column]:
     """Return the metric that ranks over all cells, and over each group of anomalies."""
     of_groups = [Column(board.ranking, g, anomalies=kinds) for g, kinds in board.groups.items()]
     return [Column(board.ranking, title), *of_groups]
-
-
-def _joined(*sentences: str) -> str:
-    return " ".join(filter(None, sentences))
-
-
-def unranked(board: Board) -> str:
-    """Return a note on the rows that no board ranks, for what they know; empty without one."""
-    marks = {str(r.setting): training_mark(r.training) for r in board.records}
-    known = [f"{row} ({mark})" if mark != row else row for row, mark in marks.items() if mark]
-    return f"Not ranked, for what they know: {', '.join(known)}." if known else ""
 
 
 def best_first(board: Board) -> list[Setting]:
@@ -196,77 +434,29 @@ def best_first(board: Board) -> list[Setting]:
     return sorted(means, key=lambda e: math.inf if math.isnan(means[e]) else -means[e])
 
 
-def guaranteed(
-    board: Board,
-    suffix: str = "",
-    *,
-    intervals: bool = False,
-    nulls: bool = False,
-    standings: Sequence[Standing] = (),
-) -> Table | None:
-    """Return guaranteed alarms at a level, mean over cells; None when no record has them.
-
-    The level is by default ``at_5pct``, or the strictest that the records have. False episodes
-    always have `intervals`. With `nulls` each figure stands beside what false alarms alone give.
-    Where `standings` are given, rows are in their order and have their places.
-    """
-    levels = [level for level in catalogue.LEVELS if board.present([f"false_episodes_{level}"])]
-    strictest = catalogue.HEADLINE if catalogue.HEADLINE in levels or not levels else levels[-1]
-    asked, suffix = suffix or catalogue.HEADLINE, suffix or strictest
-    bases = catalogue.GUARANTEED if nulls else _ALARMS
-    columns = over_all(board, [f"{name}_{suffix}" for name in bases], short=True)
-    columns = [_with_ends(column, every=intervals) for column in columns]
-    if not columns:
-        return None
-    names = [column.metric for column in columns]
-    level = _percent_of(suffix)
-    hours = f"false_alarms_per_hour_{suffix}"
-    hourly = f"{metric_info(hours).noun}, " * (hours in names)
-    steps = "delays in steps, " * any(name.startswith("delay") for name in names)
-    units = f"{steps}{hourly}the rest in %" if steps or hourly else "%"
-    episodes = "nominal twins" if board.paired else "nominal test episodes"
-    note = _joined(
-        f"The threshold promises an alarm in at most {level} of nominal episodes; false episodes "
-        f"is the share of this split's {episodes} that raised one.",
-        CENSORED * (f"delay_censored_{suffix}" in names),
-        *(lowered_level(board, asked, suffix) if asked != suffix else ()),
+def _mean(board: Board, entry: Setting, columns: Sequence[Column]) -> Value:
+    """Return a row's mean of columns, each counting once."""
+    means = [board.of(entry, column) for column in columns]
+    defined = [mean for mean in means if mean.state or not math.isnan(mean.value)]
+    return Value(
+        nan_mean(mean.value for mean in defined),
+        state=next((mean.state for mean in defined if mean.state), ""),
+        cells=sum(mean.cells for mean in means),
+        partial=0 < len(defined) < len(means) or any(mean.partial for mean in defined),
     )
-    return by_metric(board, f"Guaranteed alarms at {level} ({units})", columns, standings, note)
 
 
-def _percent_of(suffix: str) -> str:
+def _heading(name: str) -> str:
+    return "null" if name == POOLED[1] else metric_info(name).noun
+
+
+def _joined(*sentences: str) -> str:
+    return " ".join(filter(None, sentences))
+
+
+def percent_of(suffix: str) -> str:
+    """Return the level of a suffix as printed."""
     return f"{100 * catalogue.LEVELS[suffix]:g} %"
-
-
-def _with_ends(column: Column, *, every: bool) -> Column:
-    """Return a column with intervals where `every` one has them, or they are exact."""
-    return column._replace(intervals=every or metric_info(column.metric).interval == "exact")
-
-
-CENSORED: Final = "Delay censored counts a miss as the whole remainder of its episode."
-"""Sentence below each table with the delay that ranks."""
-
-
-def missing_level(board: Board, suffix: str) -> list[str]:
-    """Return how many calibration episodes a level takes that rows have no figures at."""
-    title = f"guaranteed alarms at {_percent_of(suffix)}"
-    return reasons(board, board.entries, [Column(f"false_episodes_{suffix}", title)])
-
-
-def lowered_level(board: Board, asked: str, level: str) -> list[str]:
-    """Return which rows have no figures at a level, and that another stands for all rows."""
-    lacking = missing_level(board, asked)
-    if level != asked and lacking:
-        lacking.append(f"So all rows are shown at {_percent_of(level)}.")
-    return lacking
-
-
-def papers(board: Board, standings: Sequence[Standing] = (), *, intervals: bool = False) -> Table:
-    """Return what the paper's alarm does, mean over cells, under a heading of its own."""
-    columns = over_all(board, _PAPER, _PAPER if intervals else (), short=True)
-    note = explained({c.title: c.metric for c in columns if c.metric in _PAPERS_NULLS})
-    title = f"{PAPER} (delays in steps, the rest as shares)"
-    return by_metric(board, title, columns, standings, note)
 
 
 def explained(columns: Mapping[str, str]) -> str:
@@ -275,234 +465,25 @@ def explained(columns: Mapping[str, str]) -> str:
     return f"{'; '.join(meanings)}." if columns else ""
 
 
-def attribution(
-    board: Board, *, intervals: bool = False, standings: Sequence[Standing] = ()
-) -> Table | None:
-    """Return what detectors that explain say at their guaranteed alarms; None without any."""
-    names = catalogue.ATTRIBUTION
-    explaining = {r.setting for r in board.records if r.metrics.keys() & {*names}}
-    if not explaining:
-        return None
-    if not standings:
-        board = Board([r for r in board.records if r.setting in explaining])
-    columns = [Column(n, metric_info(n).noun, intervals=intervals) for n in names]
-    title = f"Attribution at {metric_info(names[0]).level} (onset error in rows, the rest in %)"
-    ranks = [standing for standing in standings if standing.entry in explaining]
-    return by_metric(board, title, columns, ranks, _ATTRIBUTION)
+def missing_level(board: Board, suffix: str) -> list[str]:
+    """Return how many calibration episodes a level takes that rows have no figures at."""
+    title = f"guaranteed alarms at {percent_of(suffix)}"
+    return reasons(board, board.entries, [Column(f"false_episodes_{suffix}", title)])
 
 
-_ATTRIBUTION: Final = (
-    "Of the detectors that explain their scores, at the first guaranteed alarm: how often the "
-    "sensor that they name first is a corrupted one, over sensor anomalies, and how far the onset "
-    "that they name is from the effect, the median of a cell."
-)
+def lowered_level(board: Board, asked: str, level: str) -> list[str]:
+    """Return which rows have no figures at a level, and that another stands for all rows."""
+    lacking = missing_level(board, asked)
+    if level != asked and lacking:
+        lacking.append(f"So all rows are shown at {percent_of(level)}.")
+    return lacking
 
 
-def of_logs(
-    board: Board,
-    *,
-    intervals: bool = False,
-    standings: Sequence[Standing] = (),
-    level: str = "",
-    whole: bool = False,
-) -> list[Table]:
-    """Return the tables of a board without twins, the most important one first.
-
-    Parameters
-    ----------
-    board
-        The board.
-    intervals
-        Whether all means have their 95 % interval; false episodes always have.
-    standings
-        Where there are some, rows are in their order and have their places; else they are in the
-        order of their means, the best first.
-    level
-        Suffix of the level of guaranteed alarms, by default the board's.
-    whole
-        Whether each of several environments has a headline of its own, too.
-    """
-    suffix = level or board.level
-    entries = [row.entry for row in standings] or best_first(board)
-
-    def present(names: Iterable[str], environments: Sequence[str] = ()) -> list[str]:
-        some = [r for r in board.records if not environments or r.environment in environments]
-        return [name for name in names if cells_with(name, some)]
-
-    def table(
-        title: str, names: Iterable[str], environments: Sequence[str] = (), note: str = ""
-    ) -> Table:
-        columns = []
-        for info in map(metric_info, present(names, environments)):
-            text = _heading(info.name) + " (steps)" * (info.unit == "steps")
-            text += f" (≤ {_percent_of(suffix)})" * info.name.startswith("false_episodes")
-            columns.append(_with_ends(Column(info.name, text, environments), every=intervals))
-        title += f" at {_percent_of(suffix)}" * any(metric_info(c.metric).level for c in columns)
-        title += f": {', '.join(environments)}" * bool(environments)
-        asked = level or catalogue.HEADLINE
-        if f"false_episodes_{asked}" not in [c.metric for c in columns]:
-            note = _joined(note, *lowered_level(board, asked, suffix))
-        return by_metric(board, title, columns, standings, note, entries)
-
-    def at_level(*names: str) -> list[str]:
-        return [f"{name}_{suffix}" for name in names]
-
-    def headline(*environments: str) -> Iterable[Table]:
-        alarms = at_level(*_ALARMS_OF_LOGS)
-        if present((POOLED[-1], alarms[0]), environments):
-            title = "Separability (%, higher is better)"
-            title += " and guaranteed alarms" * bool(present(alarms, environments))
-            first = {_heading(name): name for name in present((*POOLED[:2], alarms[0]))}
-            note = CENSORED * bool(present([f"delay_censored_{suffix}"]))
-            note = note if environments else _joined(explained(first), note)
-            yield table(title, (*POOLED, *alarms), environments, note)
-
-    def outcomes() -> Iterable[Table]:
-        if present(["auc_outcome"]):
-            names = ["auc_outcome", *at_level("found_outcome", "found_outcome_null")]
-            names += [] if [*headline()] else [*POOLED, *nominal_alarms]
-            note = "Episodes are compared up to the same row, as failures run into the time limit."
-            if all(entry.detector != CLOCK for entry in board.entries):
-                note += (
-                    f" Add the row {CLOCK} (--detector ...,{CLOCK}) to see how much of this the "
-                    "phase of the episode alone gives."
-                )
-            yield table("Episodes known by their outcome alone (%)", names, note=note)
-
-    def nominal() -> Iterable[Table]:
-        judged = *POOLED, "auc_outcome"
-        alone = [e for e in board.environments if not present(judged, [e])]
-        if alone and present(nominal_alarms, alone):
-            some = alone if alone != board.environments else ()
-            yield table("Alarms on nominal test episodes alone", nominal_alarms, some)
-
-    nominal_alarms = at_level("false_episodes", "false_alarms_per_hour")
-    single = board.environments if whole and len(board.environments) > 1 else []
-    compared = [e for e in board.environments if present([board.ranking], [e])]
-    return [
-        *(*headline(), *outcomes(), *nominal()),
-        *_apart(board, compared, entries, standings, intervals=intervals),
-        *itertools.chain.from_iterable(map(headline, single)),
-        *([table(_OF_ROWS, ROWS)] if present(ROWS) else []),
-    ]
-
-
-_OF_ROWS: Final = "Metrics of rows, for comparison with published tables; they rank nothing"
-
-
-def _apart(
-    board: Board,
-    compared: Sequence[str],
-    entries: Sequence[Setting],
-    standings: Sequence[Standing],
-    *,
-    intervals: bool,
-) -> Iterable[Table]:
-    """Yield the metric that ranks by environment and group, where there is more than one.
-
-    `compared` are the environments that have it. Their mean counts each of them once.
-    """
-    several = compared if len(compared) > 1 else []
-    parts = [Column(board.ranking, e, [e], (), intervals) for e in several]
-    columns = parts + [c._replace(intervals=intervals) for c in _by_group(board, "")[1:]]
-    if not columns or not compared:
-        return
-    by = " and ".join(["environment"] * bool(several) + ["group"] * bool(board.groups))
-    title = metric_info(board.ranking).title
-    title = f"{title[0].upper()}{title[1:]} (%) by {by}"
-    table = by_metric(board, title, columns, standings, entries=entries)
-    if several:
-        means = [["mean", *(_mean(board, entry, parts) for entry in entries)]]
-        lines = zip((table.header, *table.rows), *means, strict=True)
-        header, *rows = [[*t[: table.labels], mean, *t[table.labels :]] for t, mean in lines]
-        note = "The mean is that of the environments, each counting once."
-        table = replace(table, header=header, rows=rows, note=note)
-    yield table
-
-
-def _mean(board: Board, entry: Setting, columns: Sequence[Column]) -> str:
-    """Return a row's mean of columns, each counting once, as printed."""
-    means = [board.of(entry, column._replace(intervals=False)) for column in columns]
-    defined = [mean for mean in means if mean.state or not math.isnan(mean.value)]
-    value = Value(
-        nan_mean(mean.value for mean in defined),
-        state=next((mean.state for mean in defined if mean.state), ""),
-        cells=sum(mean.cells for mean in means),
-        partial=0 < len(defined) < len(means) or any(mean.partial for mean in defined),
-    )
-    return show_value(value, board.ranking)
-
-
-def _heading(name: str) -> str:
-    return "null" if name == POOLED[1] else metric_info(name).noun
-
-
-def anomaly_groups(board: Board, *, intervals: bool = False) -> list[Table]:
-    """Return AUC, delay and false-alarm rate by environment: the paper's Table 5.
-
-    There is a table for each horizon and group of anomalies, and none where records lack all three.
-    """
-    if not board.present(_TABLE_5):
-        return []
-    groups = filter(board.in_group, GROUPS)
-    everything = itertools.product(board.horizons, groups)
-    return [_anomaly_group(board, h, group, intervals=intervals) for h, group in everything]
-
-
-_TABLE_5: Final = ("auc", "delay", "far")
-
-
-def _anomaly_group(board: Board, horizon: int, group: str, *, intervals: bool) -> Table:
-    """Return one of them; AVG is over detectors, without trivial rows where there are others."""
-    entries = [e for e in board.entries if e.horizon == horizon]
-    averaged = [e for e in entries if not board.is_trivial(e)] or entries
-    rows = []
-    for environment, metric in itertools.product(board.environments, _TABLE_5):
-        column = Column(metric, "", [environment], board.in_group(group), intervals)
-        means = {e: board.of(e, column) for e in entries}
-        partial = any(means[e].state or means[e].partial for e in averaged)
-        average = Value(nan_mean(means[e].value for e in averaged), cells=1, partial=partial)
-        labels = [title_of(environment), metric_info(metric).short]
-        rows.append([*labels, *(show_value(v, metric) for v in (*means.values(), average))])
-    title = f"{PAPER}. AUC (%), delay (steps), false-alarm rate (FAR), {group}, Δ = {horizon}"
-    # The title says the horizon.
-    header = ["Environment", "Result", *(str(replace(e, horizon=1)) for e in entries), "AVG"]
-    left_out = [str(e) for e in entries if e not in averaged]
-    note = f"AVG is the mean without the trivial rows: {', '.join(left_out)}." if left_out else ""
-    table = Table(title, header, rows, labels=2, note=note)
-    if len(board.environments) > 1:
-        return table
-    title += f", {title_of(board.environments[0])}"
-    return replace(table.columns(range(1, len(header))), title=title, labels=1)
-
-
-def all_metrics(board: Board, *, intervals: bool = False) -> Table:
-    """Return every metric without an alarm, mean over all cells, with nulls and the placebo."""
-    usual = [n for n, info in catalogue.METRICS.items() if info.cells != "unpaired"]
-    infos = map(metric_info, board.present(catalogue.METRICS) or usual)
-    shown = [info for info in infos if not info.request and not info.paper]
-    columns = [Column(info.name, info.title, intervals=intervals) for info in shown]
-    return by_metric(board, "All metrics of separability (%), mean over cells", columns)
-
-
-def all_alarms(board: Board, *, intervals: bool = False) -> list[Table]:
-    """Return guaranteed alarms at every level that records have, with their nulls."""
-    tables = (guaranteed(board, s, intervals=intervals, nulls=True) for s in catalogue.LEVELS)
-    return [table for table in tables if table]
-
-
-def by_anomaly(board: Board, entry: Setting, metric: str = "", *, intervals: bool = False) -> Table:
-    """Return one detector's metric by environment and anomaly, by default the one that ranks."""
-    info = metric_info(metric or board.ranking)
-    cells = {
-        e: [Column(info.name, a, [e], [a], intervals) for a in board.anomalies]
-        for e in board.environments
-    }
-    rows = [[title_of(e), *texts(board, entry, columns)] for e, columns in cells.items()]
-    note = " ".join(reasons(board, [entry], itertools.chain.from_iterable(cells.values())))
-    title = f"{entry}: {info.title}{' (%)' * (info.unit == 'percent')} by anomaly"
-    header = ["Environment", *board.anomalies]
-    return Table(title, header, rows, note=note, wrap=not board.paired)
+def unranked(board: Board) -> str:
+    """Return a note on the rows that no board ranks, for what they know; empty without one."""
+    marks = {str(r.setting): training_mark(r.training) for r in board.records}
+    known = [f"{row} ({mark})" if mark != row else row for row, mark in marks.items() if mark]
+    return f"Not ranked, for what they know: {', '.join(known)}." if known else ""
 
 
 def failures(board: Board) -> Table | None:
@@ -516,7 +497,7 @@ def ranking(ranks: RankedBoard, trust: Mapping[Setting, str]) -> Table:
     """Return ranks by separability, with what a reader needs to judge them; trust is by row."""
     board = ranks.board
     title = metric_info(board.ranking).title
-    columns = [c._replace(intervals=True) for c in _by_group(board, title)]
+    columns = [c._replace(intervals=True) for c in by_group(board, title)]
     names = [n for n in _BESIDE[board.paired] if n != board.ranking]
     names = names if board.paired else board.present(names)
     columns += [Column(name, metric_info(name).title) for name in names]
@@ -753,24 +734,6 @@ _RANK: Final = (
     "Rank is 1 + the number of primary rows that are significantly better, so ranks need not "
     "follow the means."
 )
-
-
-def by_metric(
-    board: Board,
-    title: str,
-    columns: Sequence[Column],
-    standings: Sequence[Standing] = (),
-    note: str = "",
-    entries: Sequence[Setting] = (),
-) -> Table:
-    """Return columns with a row per detector, or per standing with its place."""
-    labels = {row.entry: _labels(row) for row in standings}
-    labels = labels or {e: [str(e)] for e in entries or board.entries}
-    rows = [[*label, *texts(board, entry, columns)] for entry, label in labels.items()]
-    first = _LABELS if standings else ("detector",)
-    header = [*first, *(c.title for c in columns)]
-    note = _joined(note, *reasons(board, labels, columns))
-    return Table(title, header, rows, labels=len(first), note=note, wrap=not board.paired)
 
 
 def _labels(row: Standing) -> list[str]:

@@ -25,6 +25,7 @@ from oodd_eval.metrics.alarms import (
 from oodd_eval.metrics.auc import AlarmRule
 from oodd_eval.metrics.catalogue import FOUND_WITHIN, GUARANTEED, LEVELS, metric_info
 from oodd_eval.metrics.cusum import Standardization, cusum
+from oodd_eval.metrics.recalibration import PairedScores
 from oodd_eval.plugins.contract import Alarm
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
 from oodd_eval.results.evaluate import Rules, cell_metrics, evaluated
@@ -214,9 +215,8 @@ def test_an_ideal_detector_is_perfect(kind, noise, unit):
     calibration, twins, anomalous = ([unit * s for s in part]
                                      for part in (calibration, twins, anomalous))  # fmt: skip
     # Every nominal score is at most its noise, every anomalous one is 1.
-    found, _ = cell_metrics(
-        anomalous, twins, [30, 40, 50], effects, Rules.fit(calibration, kind), environment="ant"
-    )
+    cell = PairedScores(anomalous, twins, [30, 40, 50], effects)
+    found, _ = cell_metrics(cell, Rules.fit(calibration, kind), environment="ant")
     assert found["auc_matched"].value == found["auc_smoothed"].value == 1
     assert found["missed"].value == 0
     if noise and kind == "cusum":

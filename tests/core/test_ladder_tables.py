@@ -12,14 +12,13 @@ from oodd_eval.cli.terminal import TerminalReporter
 from oodd_eval.data.condition import Rung
 from oodd_eval.errors import SplitError
 from oodd_eval.metrics.catalogue import UNDEFINED
-from oodd_eval.results import strengths
 from oodd_eval.results import strengths as of_records
 from oodd_eval.results.board import Board
 from oodd_eval.results.collection import Results
 from oodd_eval.results.render import FORMATS
 from oodd_eval.results.report import Report
-from oodd_eval.results.strengths import DETECTION, Strengths, curve, thresholds
-from oodd_eval.results.tables import separability
+from oodd_eval.results.strengths import DETECTION, Strengths, StrengthTables, curve, thresholds
+from oodd_eval.results.tables import Tables
 
 NULL = "found_within_100_null_at_5pct"
 UNITS = {("ant", "iid"): 2.0, ("hopper", "iid"): 10.0, ("ant", "gravity"): 1.0}
@@ -72,8 +71,8 @@ def rows_of(table):
     return {row[0]: dict(zip(table.header, row, strict=True)) for row in table.rows}
 
 
-def table_of(records, start, **settings):
-    made = strengths.strength_tables(Board(records), **settings)
+def table_of(records, start, *, intervals=False, places=False):
+    made = StrengthTables(Board(records), intervals).overview(places=places)
     return next(t for t in made if t.title.startswith(start))
 
 
@@ -104,7 +103,8 @@ def test_rows_that_know_more_are_named_below_the_tables():
     oracle = [dataclasses.replace(r, detector="oracle", training="oracle") for r in RECORDS[:4]]
     note = "Not ranked, for what they know: wise (trained on external), oracle."
     for records, expected in ((RECORDS, False), ([*RECORDS, *wise, *oracle], True)):
-        shown = [table_of(records, "Detection thresholds, lower"), separability(Board(records))]
+        of_board = Tables(Board(records)).separability()
+        shown = [table_of(records, "Detection thresholds, lower"), of_board]
         assert [note in (table.note or "") for table in shown] == [expected] * 2
         assert expected or not any("Not ranked" in (table.note or "") for table in shown)
 
@@ -161,7 +161,7 @@ def test_the_next_weaker_rung_stands_in_where_a_ladder_has_none(monkeypatch):
     cells = ("drift", "kept99"), ("iid", "harsh"), ("iid", "")
     other = [make_record("rf", "ant", kind, strength=name) for kind, name in cells]
     assert Strengths.of(other).rungs == {}
-    assert not strengths.strength_tables(Board(other))
+    assert not StrengthTables(Board(other)).overview()
     assert Strengths.of(RECORDS + other).rungs.keys() == UNITS.keys()
     usual = of_records.rungs_of
 
@@ -185,7 +185,7 @@ def test_reports_and_the_terminal_have_the_tables_where_there_are_strengths():
         assert title in shown.getvalue()
     assert "### rf: detection thresholds" in text
     bare = [make_record("rf", "ant", "iid", strength=name) for name in TIMES]
-    tables = strengths.strength_tables(Board(bare), places=True)
+    tables = StrengthTables(Board(bare)).overview(places=True)
     assert [t.title for t in tables] == ["Matched AUC (%) by strength"]  # no alarms at 5 %
 
 

@@ -13,6 +13,7 @@ from oodd_eval.metrics.auc import AlarmRule, alarm_contributions, auc, cell_cont
 from oodd_eval.metrics.auc import auc_contributions as every_auc
 from oodd_eval.metrics.catalogue import ATTRIBUTION, GUARANTEED, NAMES, metric_info
 from oodd_eval.metrics.cusum import Standardization
+from oodd_eval.metrics.recalibration import PairedScores
 from oodd_eval.results.evaluate import Rules, cell_metrics
 
 NAN = math.nan
@@ -202,9 +203,8 @@ def test_values_do_not_depend_on_the_order_of_trajectories(order):
 def test_cell_has_every_metric_in_order():
     flat = [np.zeros(50)] * 2
     assert list(cell_contributions(flat, flat, [10, 20], [10, 20], RULE)) == PAIRED
-    metrics, found = cell_metrics(
-        flat, flat, [10, 20], [10, 20], Rules.fit([np.zeros(50)] * 198), environment="ant"
-    )
+    cell = PairedScores(flat, flat, [10, 20], [10, 20])
+    metrics, found = cell_metrics(cell, Rules.fit([np.zeros(50)] * 198), environment="ant")
     paired = {name for name in NAMES if metric_info(name).cells != "unpaired"}
     assert set(metrics) == paired - {*ATTRIBUTION, "auc_before"}
     assert [n for n in found if n.endswith("_at_5pct")] == [
@@ -217,6 +217,7 @@ def test_a_threshold_without_end_is_undefined_and_alarms_nowhere():
     calibration = [np.full(30, float(i % 2 and t > 30)) for i in range(40) for t in [i]]
     rules = Rules.fit(calibration)
     loud = [np.full(50, 9.0)] * 2
-    metrics, _ = cell_metrics(loud, loud, [10, 20], [10, 20], rules, environment="ant")
+    cell = PairedScores(loud, loud, [10, 20], [10, 20])
+    metrics, _ = cell_metrics(cell, rules, environment="ant")
     assert math.isnan(metrics["threshold_at_5pct"].value)
     assert metrics["missed_at_5pct"].value == 1

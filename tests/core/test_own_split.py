@@ -17,6 +17,7 @@ from oodd_eval.errors import SplitError, UsageError
 from oodd_eval.results import tables
 from oodd_eval.results.board import boards
 from oodd_eval.results.compare import read_record_set, write_reference
+from oodd_eval.results.tables import Tables
 
 OWN = {"slip": "dynamics", "fog": "sensor"}
 LIKE = {"slip": "gravity", "fog": "iid"}
@@ -88,7 +89,7 @@ def test_a_run_scores_what_each_environment_has_and_tables_name_it(place):
     (board,) = boards(results.records)
     assert board.environments == ["cartpole", "valve", "pump"]
     assert board.in_group("dynamics") == ["gravity", "slip"]
-    table = tables.by_anomaly(board, board.entries[0])
+    table = Tables(board).by_anomaly(board.entries[0])
     assert table.header == ["Environment", "gravity", "slip", "fog"]
     assert [row[0] for row in table.rows] == ["CartPole", "valve", "pump"]
     assert not [line for line in tables.notes(board) if "without" in line]

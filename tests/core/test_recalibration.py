@@ -93,8 +93,8 @@ def test_draws_and_intervals_are_those_of_the_definition(kind):
             expected.setdefault(name, []).append(contribution.value)
     again = Recalibration.fit(CALIBRATION, kind, "arm")
     # Two cells, so that a cell is more than the first of its block.
-    cells = [PairedScores(TWINS, ONSETS, EFFECTS), PairedScores(ANOMALOUS, ONSETS, EFFECTS)]
-    values = again.paired(TWINS, cells)[1]
+    cells = [PairedScores(part, TWINS, ONSETS, EFFECTS) for part in (TWINS, ANOMALOUS)]
+    values = again.of_cells(cells)[1]
     assert values.keys() == expected.keys()
     assert {"far", "delay_null", "found_within_20_null_at_5pct"} <= values.keys()
     varying = 0
@@ -123,7 +123,7 @@ def test_draws_and_intervals_are_those_of_the_definition(kind):
 def test_without_twins_the_draws_are_those_of_the_definition(kind):
     intervals = [((int(start), len(s)),) for start, s in zip(ONSETS, ANOMALOUS, strict=True)]
     cell = UnpairedScores(TWINS, ANOMALOUS, intervals, [""] * 6, [""] * 6)
-    values = Recalibration.fit(CALIBRATION, kind, "arm").unpaired(cell, rate=10.0)
+    values = Recalibration.fit(CALIBRATION, kind, "arm").of_cells([cell], 10.0)[0]
     for draw in (0, 7, DRAWS - 1):
         for suffix, rule in naive_rules(draw, kind)[1].items():
             for name, terms in unpaired_alarms(cell, rule, 10.0).items():
@@ -148,12 +148,12 @@ def test_drawn_thresholds_spread_as_fresh_ones_do():
 def test_scores_that_do_not_vary_have_no_noise_and_no_alarm():
     still = [np.zeros(9)] * 40
     again = Recalibration.fit(still, "cusum", "arm")
-    values = again.paired(still[:2], [PairedScores(still[:2], np.array([3, 3]), np.array([3, 3]))])
+    values = again.of_cells([PairedScores(still[:2], still[:2], [3, 3], [3, 3])])
     assert {name: set(v) for name, v in values[0].items()}["missed_at_5pct"] == {1.0}
     assert not any(map(len, CodedDraws.of(values[0]).values()))
     loud = [np.append(np.zeros(8), 1.0)] * 2
-    cells = [PairedScores(loud, np.array([3, 3]), np.array([3, 3]))]
-    assert set(again.paired(still[:2], cells)[0]["delay_at_5pct"]) == {5.0}
+    cells = [PairedScores(loud, still[:2], [3, 3], [3, 3])]
+    assert set(again.of_cells(cells)[0]["delay_at_5pct"]) == {5.0}
 
 
 def test_a_record_keeps_draws_in_few_characters():

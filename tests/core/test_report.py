@@ -18,6 +18,7 @@ from oodd_eval.cli.main import main
 from oodd_eval.cli.terminal import TerminalReporter
 from oodd_eval.metrics.bootstrap import bounds, drawn_cell, sample_cells
 from oodd_eval.metrics.catalogue import PAPER
+from oodd_eval.metrics.recalibration import PairedScores
 from oodd_eval.prose import print_prose
 from oodd_eval.results import tables
 from oodd_eval.results.board import Board, boards, contribution
@@ -28,7 +29,7 @@ from oodd_eval.results.render import FORMATS
 from oodd_eval.results.render.text import print_table
 from oodd_eval.results.report import Report, findings_of
 from oodd_eval.results.standings import compare_rows, verdict_of
-from oodd_eval.results.tables import Table, why_undefined
+from oodd_eval.results.tables import Table, Tables, why_undefined
 
 
 def rendered(records, name="markdown", **settings):
@@ -200,7 +201,7 @@ def test_many_findings_are_folded_and_few_are_not():
 
 
 def test_separability_is_by_mean_matched_auc_with_failures_last():
-    table = tables.separability(Board(example()))
+    table = Tables(Board(example())).separability()
     assert [row[0] for row in table.rows] == ["riqn", "persistence", "clock", "rf"]
     # riqn: iid 0.7; gravity (0.6 + 0.7) / 2 = 0.65; mean 0.675.
     assert cells(table, 0) == {
@@ -212,7 +213,7 @@ def test_separability_is_by_mean_matched_auc_with_failures_last():
 
 
 def test_table_five_has_the_papers_layout_and_averages_without_trivial_rows():
-    sensor, dynamics = tables.anomaly_groups(Board(example()))
+    sensor, dynamics = Tables(Board(example())).anomaly_groups()
     assert sensor.header == ["Environment", "Result", "riqn", "rf", "persistence", "clock", "AVG"]
     assert [row[:2] for row in sensor.rows] == [
         [e, m] for e in ("Ant", "Hopper") for m in ("AUC", "Delay", "FAR")
@@ -225,7 +226,7 @@ def test_table_five_has_the_papers_layout_and_averages_without_trivial_rows():
     assert cells(dynamics, 4)["riqn"] == "4.0"
     for detectors in (("riqn", "rf"), ("clock",)):
         board = Board([r for r in example() if r.detector in detectors])
-        assert not tables.anomaly_groups(board)[0].note
+        assert not Tables(board).anomaly_groups()[0].note
 
 
 def test_no_table_mixes_digests_protocols_or_limits():
@@ -243,7 +244,7 @@ def test_means_over_seeds_over_fewer_cells_and_with_intervals():
         make_record(seed=1, values={"auc_matched": [0.8, 0.8]}),
         make_record("rf"), make_record("rf", anomaly="drift"),
     ])  # fmt: skip
-    texts = {row[0]: row[1] for row in tables.separability(board).rows}
+    texts = {row[0]: row[1] for row in Tables(board).separability().rows}
     assert texts == {"riqn": "60.0*", "rf": "50.0"}  # one of two cells is marked
     # Trajectories agree within each seed, so that the interval is the seeds' alone.
     value = board.mean(board.entries[0], ["hopper"], ["iid"], "auc_matched", intervals=True)
@@ -294,31 +295,31 @@ ALARMS = {
 
 def test_guaranteed_alarms_stand_beside_false_episodes_with_their_interval():
     board = Board([make_record(anomaly=a, values=ALARMS) for a in ("iid", "drift")])
-    table = tables.guaranteed(board)
+    table = Tables(board).guaranteed()
     assert cells(table, 0) == {
         "detector": "riqn", "delay censored": "20.0", "missed": "50.0", "found within 20": "50.0",
         "found within 100": "50.0", "found within 100 null": "50.0",
         "false episodes": "50.0 [1.3, 98.7]", "early": "0.0",
     }  # fmt: skip
     assert "whole remainder" in table.note
-    nulls = tables.guaranteed(board, nulls=True)
+    nulls = Tables(board).guaranteed(nulls=True)
     assert cells(nulls, 0)["delay if found"] == "4.0"
     assert nulls.header[-2:] == ["found within 100", "found within 100 null"]
 
 
 def test_the_table_of_alarms_is_of_the_strictest_level_where_5_percent_is_not_offered():
-    assert tables.guaranteed(Board([make_record()])) is None
+    assert Tables(Board([make_record()])).guaranteed() is None
     few = {"false_episodes_at_10pct": [0, 0], "missed_at_10pct": [0, 1]}
-    assert "at 10 %" in tables.guaranteed(Board([make_record(values=few)])).title
+    assert "at 10 %" in Tables(Board([make_record(values=few)])).guaranteed().title
     both = few | {"missed_at_1pct": [1, 1], "false_episodes_at_1pct": [0, 0]}
-    assert "at 1 %" in tables.guaranteed(Board([make_record(values=both)])).title
-    assert len(tables.all_alarms(Board([make_record(values=both | ALARMS)]))) == 3
+    assert "at 1 %" in Tables(Board([make_record(values=both)])).guaranteed().title
+    assert len(Tables(Board([make_record(values=both | ALARMS)])).all_alarms()) == 3
 
 
 def test_brief_cells_are_marked_and_named():
     records = [make_record(anomaly="iid", brief=True), make_record(anomaly="drift")]
     board = Board(records)
-    (row,) = tables.by_anomaly(board, board.entries[0]).rows
+    (row,) = Tables(board).by_anomaly(board.entries[0]).rows
     assert row == ["Hopper", "50.0\N{DAGGER}", "50.0"]
     (note,) = [line for line in tables.notes(board) if "Brief" in line]
     assert "hopper/iid" in note
@@ -418,9 +419,9 @@ def calibrated(detector, episodes, alarm="cusum", level="5", environment="hopper
 def test_a_level_that_calibration_episodes_are_too_few_for_is_named():
     # A CUSUM standardizes with half of them: 2 x 19 are needed at 5 %, 2 x 9 at 10 %.
     few, strict = calibrated("rf", 30, level="10"), calibrated("pe", 40)
-    assert "rf: guaranteed alarms at 5 % (30" in tables.guaranteed(Board([few])).note
+    assert "rf: guaranteed alarms at 5 % (30" in Tables(Board([few])).guaranteed().note
     mixed = Board([few, calibrated("pe", 30, "score")])
-    table = tables.guaranteed(mixed)
+    table = Tables(mixed).guaranteed()
     assert "at 5 %" in table.title
     assert cells(table, 0) == dict.fromkeys(table.header, "\N{EN DASH}") | {"detector": "rf"}
     assert "Undefined for rf: missed, false episodes, early (30" in table.note
@@ -432,7 +433,7 @@ def test_a_level_that_calibration_episodes_are_too_few_for_is_named():
     assert any("pe: guaranteed alarms at 1 % (40" in text for text in section.findings)
     # Without any level there is no table, and the report says why.
     none = replace(calibrated("rf", 17), metrics={}, per_trajectory={})
-    assert tables.guaranteed(Board([none])) is None
+    assert Tables(Board([none])).guaranteed() is None
     assert "(17 calibration episodes" in " ".join(findings_of(Board([none])))
 
 
@@ -442,7 +443,7 @@ def test_a_level_that_calibration_episodes_are_too_few_for_is_named():
 )
 def test_the_number_of_calibration_episodes_is_a_reason_where_it_is_one(episodes, alarm, needed):
     record = calibrated("pe", episodes, alarm)
-    note = tables.guaranteed(Board([record])).note
+    note = Tables(Board([record])).guaranteed().note
     if not needed:
         assert "calibration" not in note
         return
@@ -473,7 +474,8 @@ NOTHING, RISING = np.full(60, np.nan), np.linspace(0, 1, 60)
 )
 def test_all_that_a_cell_leaves_undefined_has_its_reason(anomalous, twin, effect):
     rules = Rules.fit([RISING] * 40)
-    metrics, _ = cell_metrics([anomalous], [twin], [effect], [effect], rules, environment="arm")
+    cell = PairedScores([anomalous], [twin], [effect], [effect])
+    metrics, _ = cell_metrics(cell, rules, environment="arm")
     record = replace(make_record(), metrics=metrics)
     undefined = [name for name in metrics if np.isnan(metrics[name].value)]
     assert undefined

@@ -15,14 +15,14 @@ from oodd_eval.cli.main import main
 from oodd_eval.data.facts import GROUPS
 from oodd_eval.errors import ResultsError
 from oodd_eval.metrics.catalogue import PAPER
-from oodd_eval.results import tables
 from oodd_eval.results.board import Board, boards
 from oodd_eval.results.record import Metric
 from oodd_eval.results.render import FORMATS
 from oodd_eval.results.render.text import print_sections
 from oodd_eval.results.report import Report, findings_of, flat
 from oodd_eval.results.standings import compare_rows, ranked
-from oodd_eval.results.strengths import by_place, strength_tables, thresholds
+from oodd_eval.results.strengths import StrengthTables, thresholds
+from oodd_eval.results.tables import Tables
 
 TWIN_WORDS = ("twin", "matched", "placebo", "unpaired", "smoothed")
 
@@ -204,10 +204,10 @@ def test_outcomes_are_one_table_with_the_clock_in_it_and_rank():
     ranks = ranked(records)
     assert ranks.board.ranking == "auc_outcome"
     assert list(ranks.alarms.ranks) == ["mewma", "clock"]
-    (alone,) = tables.of_logs(Board(records[1:]))
+    (alone,) = Tables(Board(records[1:])).of_logs()
     assert ("clock" in alone.note, "clock" in first.note) == (True, False)
     # Guaranteed alarms without delays speak of none.
-    titles = [table.title for table in tables.all_alarms(Board(records))]
+    titles = [table.title for table in Tables(Board(records)).all_alarms()]
     assert titles
     assert not [title for title in titles if "delay" in title]
 
@@ -299,17 +299,17 @@ def test_strengths_have_the_unit_that_the_split_names():
                     values={"found_within_100_at_5pct": [share, share]})
         for name, share in shares.items()
     ]  # fmt: skip
-    tables = strength_tables(Board(records), units={"drift": "rad"})
+    of_board = StrengthTables(Board(records), units={"drift": "rad"})
+    tables = of_board.overview()
     assert [t.header[-1] for t in tables if "by anomaly" in t.title] == ["drift (rad)"]
-    board, row, by_row = Board(records), records[0].setting, thresholds(records)
-    table = by_place(board, row, by_row, units={"drift": "rad"})
-    assert table.header == ["Environment", "drift (rad)"]
-    assert by_place(board, row, by_row).header[1] == "drift"
+    row = records[0].setting, thresholds(records)[records[0].setting]
+    assert of_board.by_place(*row).header == ["Environment", "drift (rad)"]
+    assert StrengthTables(Board(records)).by_place(*row).header[1] == "drift"
     unpaired = [
         log_record("mine", strength=n, magnitude=float(n), values=labelled(s, 0.6))
         for n, s in (("1", 0.6), ("2", 0.8))
     ]
-    (table,) = strength_tables(Board(unpaired))
+    (table,) = StrengthTables(Board(unpaired)).overview()
     assert table.rows == [["mine", "60.0", "80.0"]]
 
 

@@ -87,85 +87,87 @@ const LEAD = plainColumn(
   { better: "higher", text: (held, row) => isNumber(held) ? row.lead : UNDEFINED },
 );
 
-/** Columns of those of some metrics that a board has. */
-const metricColumns = (board, metrics) => known(board, metrics).map((metric) => metricColumn(board, metric, {
-  interval: board.intervals.includes(metric),
-  title: metric.endsWith(board.level) ? DATA.metrics[metric].title.replace(` at ${levelOf(board)}`, "") : undefined,
+/** Columns of those of some metrics that a board has; the caption names the level of logs. */
+const metricColumns = (board, metrics, interval = true) => known(board, metrics).map((metric) => metricColumn(board, metric, {
+  interval: interval && board.intervals.includes(metric),
+  title: !board.paired && metric.endsWith(board.level) ? DATA.metrics[metric].title.replace(` at ${levelOf(board)}`, "") : undefined,
 }));
 
-const ROW_METRICS = ["f1_rows", "far_rows", "mar_rows", "vus_pr"];
+/** Columns of the metric that ranks over parts of the cells, beside that over all; `parts` are [key, title, hint, selection]. */
+const rankingColumns = (board, parts) => [metricColumn(board, board.ranking), ...parts.map(([key, title, hint, within]) =>
+  metricColumn(board, board.ranking, { key, title, hint: `${rankingTitle(board)} ${hint}`, within, interval: true }))];
 
+const ROW_METRICS = ["f1_rows", "far_rows", "mar_rows", "vus_pr"];
+const BESIDE_RANKING = ["auc_pool", "auc_pool_null", "auc_rows", "auc_outcome", "auc_smoothed", "auc_unpaired", "auc", "auc_placebo"];
+const OF_ALARMS = ["delay_censored", "found_outcome", "found_outcome_null", "events_found", "delay", "missed", "found_within_20",
+  "found_within_100", "found_within_100_null", "false_episodes", "early", "false_alarms_per_hour"];
+const AT_OTHER_LEVELS = {
+  true: ["delay", "missed", "found_within_20", "found_within_100", "found_within_100_null", "false_episodes", "early"],
+  false: ["delay", "missed", "false_episodes"],
+}; // by whether episodes are paired
+
+/** The views: a board leaves out columns that it has no numbers for, and views that are `only` of the other kind. */
 const LISTS = {
   ranking: {
     title: "Separability",
-    columns(board, selection) {
-      return [
-        { ...metricColumn(board, "auc_matched", { interval: true }), whisker: true },
-        ...groupColumns(board, selection),
-        metricColumn(board, "auc_smoothed"),
-        metricColumn(board, "auc_unpaired"),
-        metricColumn(board, "auc"),
-        metricColumn(board, "auc_placebo"),
-        winsColumn(board),
-        LEAD,
-      ];
-    },
+    columns: (board, selection) => !board.parts[board.ranking] ? [] : [
+      { ...metricColumn(board, board.ranking, { interval: true }), whisker: true },
+      ...groupColumns(board, selection),
+      ...metricColumns(board, BESIDE_RANKING.filter((metric) => metric !== board.ranking), !board.paired),
+      winsColumn(board),
+      LEAD,
+    ],
+    empty: "This board has nominal episodes alone, so there is nothing to separate: see its alarms.",
   },
   aucs: {
     title: "AUCs",
+    only: true,
     columns: (board) => [
-      metricColumn(board, "auc_matched", { interval: true }),
-      metricColumn(board, "auc_smoothed", { interval: true }),
-      metricColumn(board, "auc_unpaired", { interval: true }),
-      metricColumn(board, "auc_placebo"),
-      metricColumn(board, "auc", { interval: true }),
+      ...metricColumns(board, ["auc_matched", "auc_smoothed", "auc_unpaired", "auc_placebo", "auc"]),
       paperColumn("auc", "Paper\u2019s AUC", "%", "percent"),
-      metricColumn(board, "auc_null"),
+      ...metricColumns(board, ["auc_null"]),
     ],
   },
   guaranteed: {
     title: "Alarms",
     rank: ALARM_RANK,
     sort: "alarm_rank",
-    columns: (board) => ["at_5pct", "at_10pct", "at_1pct"].flatMap((suffix) =>
-      ["delay_censored", "delay", "missed", "found_within_20", "found_within_100", "found_within_100_null",
-        "false_episodes", "early"]
-        .map((m) => `${m}_${suffix}`)
-        .filter((m) => board.metrics.includes(m) && (suffix === "at_5pct" || !m.startsWith("delay_censored")))
-        .map((m) => metricColumn(board, m, { interval: board.intervals.includes(m) }))),
+    level: levelOf,
+    columns: (board) => metricColumns(board, [
+      ...OF_ALARMS.map((metric) => `${metric}_${board.level}`),
+      ...["at_5pct", "at_10pct", "at_1pct"].filter((suffix) => suffix !== board.level)
+        .flatMap((suffix) => AT_OTHER_LEVELS[board.paired].map((metric) => `${metric}_${suffix}`)),
+    ]),
     empty: "No record of this board has guaranteed alarms: too few calibration episodes.",
   },
   alarms: {
     title: "Paper\u2019s alarms",
+    only: true,
     columns: (board) => [
-      ...PAPERS.map((metric) => metricColumn(board, metric, { title: underHeading(DATA.metrics[metric].title), interval: true })),
+      ...known(board, PAPERS).map((metric) => metricColumn(board, metric, { title: underHeading(DATA.metrics[metric].title), interval: true })),
       paperColumn("delay", "Paper\u2019s delay", "steps", "steps"),
       paperColumn("far", "Paper\u2019s FAR", "", "rate"),
     ],
   },
   environments: {
     title: "By environment",
-    columns: (board, selection) => [
-      metricColumn(board, board.ranking),
-      ...board.environments
-        .filter((e) => ["all", environmentOf(board, e).family, e].includes(selection.environment))
-        .map((e) => metricColumn(board, board.ranking, {
-          key: e, title: environmentOf(board, e).title, within: { environment: e }, interval: true,
-          hint: `${rankingTitle(board)} in ${environmentOf(board, e).title}`,
-        })),
-    ],
+    columns: (board, { environment }) => rankingColumns(board, board.environments
+      .map((e) => [e, environmentOf(board, e)])
+      .filter(([e, { family }]) => ["all", family, e].includes(environment))
+      .map(([e, { title }]) => [e, title, `in ${title}`, { environment: e }])),
   },
   anomalies: {
     title: "By anomaly",
-    columns: (board, selection) => [
-      metricColumn(board, board.ranking),
-      ...inGroup(board, selection.group)
-        .filter((a) => ["all", a].includes(selection.anomaly))
-        .map((a) => metricColumn(board, board.ranking, {
-          key: a, title: anomalyOf(board, a).title, within: { anomaly: a, group: "all" }, interval: true,
-          hint: [`${rankingTitle(board)} under ${anomalyOf(board, a).title}`, anomalyOf(board, a).summary].filter(Boolean).join(": "),
-        })),
-    ],
+    columns: (board, { group, anomaly }) => rankingColumns(board, inGroup(board, group)
+      .filter((a) => ["all", a].includes(anomaly))
+      .map((a) => [a, anomalyOf(board, a)])
+      .map(([a, { title, summary }]) => [a, title, [`under ${title}`, summary].filter(Boolean).join(": "), { anomaly: a, group: "all" }])),
+  },
+  rows: {
+    title: "Metrics of rows",
+    only: false,
+    columns: (board) => metricColumns(board, ROW_METRICS),
+    empty: "No record of this board has metrics of rows: they are computed on request, for comparison with published tables, and rank nothing.",
   },
   cost: {
     title: "Cost",
@@ -178,47 +180,11 @@ const LISTS = {
   },
 };
 
-/** The views of boards whose episodes have no twins. */
-const LISTS_OF_LOGS = {
-  ranking: {
-    title: "Separability",
-    columns: (board, selection) => !board.parts[board.ranking] ? [] : [
-      { ...metricColumn(board, board.ranking, { interval: true }), whisker: true },
-      ...groupColumns(board, selection),
-      ...metricColumns(board, ["auc_pool", "auc_pool_null", "auc_rows", "auc_outcome"].filter((metric) => metric !== board.ranking)),
-      winsColumn(board),
-      LEAD,
-    ],
-    empty: "This board has nominal episodes alone, so there is nothing to separate: see its alarms.",
-  },
-  guaranteed: {
-    title: "Alarms",
-    rank: { ...ALARM_RANK, hint: "1 plus the number of rows that are significantly better by the first column" },
-    sort: "alarm_rank",
-    level: levelOf,
-    columns: (board) => [
-      ...["delay_censored", "found_outcome", "found_outcome_null", "events_found", "delay", "missed", "found_within_20", "found_within_100",
-        "found_within_100_null", "false_episodes", "early", "false_alarms_per_hour"].map((metric) => `${metric}_${board.level}`),
-      ...["at_5pct", "at_10pct", "at_1pct"].filter((suffix) => suffix !== board.level)
-        .flatMap((suffix) => ["delay", "missed", "false_episodes"].map((metric) => `${metric}_${suffix}`)),
-    ].flatMap((metric) => metricColumns(board, [metric])),
-    empty: LISTS.guaranteed.empty,
-  },
-  environments: LISTS.environments,
-  anomalies: LISTS.anomalies,
-  rows: {
-    title: "Metrics of rows",
-    columns: (board) => metricColumns(board, ROW_METRICS),
-    empty: "No record of this board has metrics of rows: they are computed on request, for comparison with published tables, and rank nothing.",
-  },
-  cost: LISTS.cost,
-};
-
 /** The views that a board has. */
-const listsOf = (board) => board.paired ? LISTS : LISTS_OF_LOGS;
+const listsOf = (board) => Object.fromEntries(Object.entries(LISTS).filter(([, { only = board.paired }]) => only === board.paired));
 
 /** The view that is chosen, or the first where a board has no such view. */
-const listOf = (board, view) => listsOf(board)[view] ?? listsOf(board).ranking;
+const listOf = (board, view) => listsOf(board)[view] ?? LISTS.ranking;
 
 /** Columns of a view that this board has numbers for. */
 function columnsOf(board, state) {

@@ -101,6 +101,15 @@ function dropdown(name, label, options, chosen, choose) {
     options.map(([value, text]) => element("option", { value, selected: value === chosen }, text))));
 }
 
+/** A table: its caption, titles of columns, the first to the left, and its lines. */
+const tableOf = (attributes, caption, titles, lines) => element("table", attributes, captionOf(caption),
+  element("thead", {}, element("tr", {}, titles.map((title, i) => element("th", { scope: "col", class: i ? null : "left" }, title)))),
+  element("tbody", {}, lines));
+
+/** A line of a table: its heading, and cells that are texts or elements. */
+const lineOf = (heading, cells, attributes = {}) => element("tr", attributes, element("th", { scope: "row" }, heading),
+  cells.map((cell) => cell instanceof Element && cell.tagName === "TD" ? cell : element("td", {}, cell)));
+
 const isDark = () => document.documentElement.dataset.theme === "dark";
 
 /** A box that scrolls sideways when its content is wider than the page, by keyboard, too. */

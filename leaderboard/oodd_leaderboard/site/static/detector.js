@@ -151,46 +151,39 @@ function cellPart(board, row, cell) {
   const { state, reason } = of(board.ranking);
   if (state) return element("p", { class: "failure" }, element("strong", {}, state), `: ${reason}`);
   const text = (metric) => {
-    const found = of(metric);
     const { kind } = DATA.metrics[metric];
-    const unit = titleOfUnit[kind] === "%" ? "\u202f%" : kind === "steps" ? " steps" : "";
-    const interval = isNumber(found.low) ? ` [${show(found.low, kind)}, ${show(found.high, kind)}]` : "";
-    return show(found.value, kind) + unit + interval;
+    return show(of(metric).value, kind) + ({ percent: "\u202f%", steps: " steps" }[kind] ?? "") + intervalOf(of(metric), kind);
   };
-  if (!board.paired) return cellOfLogs(board, row, cell, of, text);
+  const sentence = element("p", {}, board.paired ? sentenceOfCell(board, cell, text) : sentenceOfLogs(board, of, text));
+  const curves = curvesOf(row, `${cell.environment}/${cell.anomaly}`);
+  if (!curves) return [sentence, element("p", { class: "note" }, "This entry has no curves for this cell.")];
+  const seed = board.paired && row.seeds.length > 1 ? element("p", { class: "note" }, `Curves of detector seed ${curves.seed}; numbers are means over seeds.`) : null;
+  return [sentence, seed,
+    element("div", { class: "figures" }, rocFigure(curves.roc, of(board.paired ? "auc_matched" : "auc_pool").value, board.paired), delayFigure(curves.delay_far)),
+    exampleFigure(curves.example, sensorsOf(board, cell, curves.example))];
+}
+
+/** The figures of a cell with twins in words; `text` gives those of a metric. */
+function sentenceOfCell(board, cell, text) {
   const guaranteed = !board.metrics.includes("delay_at_5pct") ? "" :
     `Guaranteed alarms at 5 %: delay ${text("delay_at_5pct")}, missed ${text("missed_at_5pct")}, ` +
     `found within 20 rows ${text("found_within_20_at_5pct")}, false episodes ${text("false_episodes_at_5pct")}. `;
-  const sentence = element("p", {},
-    `What changes: ${DATA.anomalies[cell.anomaly].summary}. Matched AUC ${text("auc_matched")}. ${guaranteed}At the paper\u2019s threshold: delay ${text("delay")}, ` +
+  return `What changes: ${DATA.anomalies[cell.anomaly].summary}. Matched AUC ${text("auc_matched")}. ${guaranteed}At the paper\u2019s threshold: delay ${text("delay")}, ` +
     `against ${text("delay_null")} from false alarms alone; missed ${text("missed")}; ` +
-    `false-alarm rate ${text("far_twin")} on nominal twins. Brackets are 95 % intervals.`);
-  const curves = curvesOf(row, `${cell.environment}/${cell.anomaly}`);
-  if (!curves) return [sentence, element("p", { class: "note" }, "This entry has no curves for this cell.")];
-  const at = (metric) => of(metric).value;
-  const seed = row.seeds.length > 1 ? element("p", { class: "note" }, `Curves of detector seed ${curves.seed}; numbers are means over seeds.`) : null;
-  return [sentence, seed,
-    element("div", { class: "figures" }, rocFigure(curves.roc, at("auc_matched")), delayFigure(curves.delay_far)),
-    trajectoryFigure(curves.example, sensorsOf(board, cell, curves.example))];
+    `false-alarm rate ${text("far_twin")} on nominal twins. Brackets are 95 % intervals.`;
 }
 
-/** Numbers and drawings of one cell whose episodes have no twins. */
-function cellOfLogs(board, row, cell, of, text) {
+/** The same without twins: the figures that the cell has. */
+function sentenceOfLogs(board, of, text) {
   const metrics = [
     "auc_pool", "auc_pool_null", "auc_rows", "auc_outcome",
     ...["found_outcome", "events_found", "delay", "missed", "false_episodes", "false_alarms_per_hour"].map((m) => `${m}_${board.level}`),
   ];
-  const defined = known(board, metrics).filter((metric) => isNumber(of(metric).value));
-  const parts = defined.map((metric) => {
+  const parts = known(board, metrics).filter((metric) => isNumber(of(metric).value)).map((metric) => {
     const { title } = DATA.metrics[metric];
     return `${/^[A-Z][a-z]/.test(title) ? title[0].toLowerCase() + title.slice(1) : title} ${text(metric)}`;
   });
-  const sentence = element("p", {}, parts.length ? `This cell: ${parts.join(", ")}. Brackets are 95 % intervals.` : "No metric of this cell has a value.");
-  const curves = curvesOf(row, `${cell.environment}/${cell.anomaly}`);
-  if (!curves) return [sentence, element("p", { class: "note" }, "This entry has no curves for this cell.")];
-  return [sentence,
-    element("div", { class: "figures" }, rocFigure(curves.roc, of("auc_pool").value, false), delayFigure(curves.delay_far)),
-    episodeFigure(curves.example)];
+  return parts.length ? `This cell: ${parts.join(", ")}. Brackets are 95 % intervals.` : "No metric of this cell has a value.";
 }
 
 /** A promise of what sensors read in an example, where the site has that; null where not. */
@@ -221,16 +214,14 @@ function comparisons(board, row) {
   const found = [...part.comparisons];
   if (!found.length) return null;
   const links = new Map(board.rows.map((r) => [r.label, r.id]));
-  return section("Against the others", "comparisons", scroller(element("table", { class: "plain" },
-    captionOf(`Differences in mean ${rankingName(board)} (percentage points) over all cells, by paired bootstrap (${board.resamples} resamples) with Holm\u2019s correction over the board`),
-    element("thead", {}, element("tr", {}, ["Detector", "Difference", "95 % interval", "Verdict", "Cells won (%)"].map((t, i) =>
-      element("th", { scope: "col", class: i ? null : "left" }, t)))),
-    element("tbody", {}, found.sort((a, b) => a[1] - b[1]).map(([other, difference, low, high]) => element("tr", {},
-      element("th", { scope: "row" }, element("a", { href: address("compare", row.id, links.get(other)) }, breakable(other))),
-      element("td", {}, signed(difference)),
-      element("td", {}, `[${signed(low)}, ${signed(high)}]`),
-      element("td", { class: verdictOf(part, other).split(" ")[0] }, verdictOf(part, other)),
-      element("td", {}, isNumber(part.wins[other]) ? (100 * part.wins[other]).toFixed(0) : UNDEFINED)))))));
+  return section("Against the others", "comparisons", scroller(tableOf({ class: "plain" },
+    `Differences in mean ${rankingName(board)} (percentage points) over all cells, by paired bootstrap (${board.resamples} resamples) with Holm\u2019s correction over the board`,
+    ["Detector", "Difference", "95 % interval", "Verdict", "Cells won (%)"],
+    found.sort((a, b) => a[1] - b[1]).map(([other, difference, low, high]) => lineOf(
+      element("a", { href: address("compare", row.id, links.get(other)) }, breakable(other)),
+      [signed(difference), `[${signed(low)}, ${signed(high)}]`,
+        element("td", { class: verdictOf(part, other).split(" ")[0] }, verdictOf(part, other)),
+        isNumber(part.wins[other]) ? (100 * part.wins[other]).toFixed(0) : UNDEFINED])))));
 }
 
 /** Whether a row is better or worse than another, after Holm's correction over the board. */
@@ -277,9 +268,7 @@ function metricsTable(board, row) {
     metricLines(board, 4, (metric) => {
       const { kind, meaning } = DATA.metrics[metric];
       const found = mean(board, row, metric);
-      return [element("td", {}, meanText(found, kind)),
-        element("td", {}, isNumber(found.low) ? `[${show(found.low, kind)}, ${show(found.high, kind)}]` : ""),
-        element("td", { class: "text" }, meaning)];
+      return [element("td", {}, meanText(found, kind)), element("td", {}, intervalOf(found, kind).trim()), element("td", { class: "text" }, meaning)];
     })));
 }
 

@@ -160,3 +160,6 @@ function meanText(found, kind) {
   if (!found.cells) return "";
   return (found.state || show(found.value, kind)) + (found.partial ? "*" : "");
 }
+
+/** The interval of a mean in brackets, behind a space; nothing where there is none. */
+const intervalOf = ({ low, high }, kind) => isNumber(low) ? ` [${show(low, kind)}, ${show(high, kind)}]` : "";

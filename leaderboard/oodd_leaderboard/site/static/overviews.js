@@ -46,12 +46,9 @@ function costPage(board) {
       tabs("cost-axis", "Cost of", Object.entries(COSTS).map(([key, { title }]) => [key, title]), overview.cost, again),
       csvButton("quality-and-cost", () => document.getElementById("costs"))),
     figure([plot.drawing], [], "Up and to the left is better: more is found, for less."),
-    element("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "Quality and cost as a table" }, element("table", { class: "plain", id: "costs" },
-      captionOf("The same as numbers"),
-      element("thead", {}, element("tr", {}, ["Detector", `${rankingTitle(board)} (%)`, "Score (\u00b5s per step)", "Fit (s)", "Memory (MB)"].map((text, i) =>
-        element("th", { scope: "col", class: i ? null : "left" }, text)))),
-      element("tbody", {}, drawn.map(({ row, y }) => element("tr", {}, element("th", { scope: "row" }, rowLink(row)),
-        element("td", {}, meanText(y, "percent")), ["step", "fit", "peak"].map((name) => element("td", {}, costText(row.cost[name])))))))),
+    element("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "Quality and cost as a table" }, tableOf({ class: "plain", id: "costs" },
+      "The same as numbers", ["Detector", `${rankingTitle(board)} (%)`, "Score (\u00b5s per step)", "Fit (s)", "Memory (MB)"],
+      drawn.map(({ row, y }) => lineOf(rowLink(row), [meanText(y, "percent"), ...["step", "fit", "peak"].map((name) => costText(row.cost[name]))])))),
   ];
 }
 

@@ -74,13 +74,12 @@ function pairFigure(board, rows) {
 /** Five figures of both rows, or as many of them as the board has. */
 function shortTable(board, rows) {
   const metrics = shortList(board).filter((metric) => metric === board.ranking || !metric.startsWith("auc"));
-  const line = (title, meaning, texts) => element("tr", {}, element("th", { scope: "row", title: meaning }, title,
-    element("span", { class: "under" }, sentence(meaning))), texts.map((text) => element("td", {}, text)));
-  return scroller(element("table", { class: "plain short", id: "short" }, captionOf("In short: means over all cells"),
-    element("thead", {}, element("tr", {}, element("th", { scope: "col", class: "left" }, "Metric"), rows.map((row) => element("th", { scope: "col" }, breakable(row.label))))),
-    element("tbody", {},
-      metrics.map((metric) => line(withUnit(metric), DATA.metrics[metric].meaning, rows.map((row) => meanText(mean(board, row, metric), DATA.metrics[metric].kind)))),
-      line("Score (\u00b5s per step)", "Microseconds per scored step", rows.map((row) => costText(row.cost.step))))));
+  const short = (title, meaning, texts) => lineOf([title, element("span", { class: "under" }, sentence(meaning))], texts);
+  return scroller(tableOf({ class: "plain short", id: "short" }, "In short: means over all cells",
+    ["Metric", ...rows.map((row) => breakable(row.label))], [
+      ...metrics.map((metric) => short(withUnit(metric), DATA.metrics[metric].meaning, rows.map((row) => meanText(mean(board, row, metric), DATA.metrics[metric].kind)))),
+      short("Score (\u00b5s per step)", "Microseconds per scored step", rows.map((row) => costText(row.cost.step))),
+    ]));
 }
 
 function pairTable(board, rows) {
@@ -90,7 +89,6 @@ function pairTable(board, rows) {
       metricLines(board, 3, (metric) => rows.map((row) => {
         const { kind } = DATA.metrics[metric];
         const found = mean(board, row, metric);
-        const ends = isNumber(found.low) ? ` [${show(found.low, kind)}, ${show(found.high, kind)}]` : "";
-        return element("td", {}, meanText(found, kind) + ends);
+        return element("td", {}, meanText(found, kind) + intervalOf(found, kind));
       }))));
 }

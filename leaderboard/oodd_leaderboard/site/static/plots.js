@@ -174,30 +174,38 @@ function sensorCharts(sensors, example, x, wide, onset) {
   });
 }
 
-function trajectoryFigure(example, sensors = null) {
-  const rows = (list) => list.map((_, i) => example.start + i);
-  const last = example.start + Math.max(example.scores.length, example.twin.length) - 1;
+/**
+ * Scores and statistic of one episode: beside its twin's, from the onset on, or without a twin with its anomalous
+ * rows shaded. `sensors` is a promise of what its sensors read.
+ */
+function exampleFigure(example, sensors = null) {
+  const paired = Boolean(example.twin);
+  const last = example.start + Math.max(example.scores.length, example.twin?.length ?? 0) - 1;
   const x = { range: [example.start, last], ticks: ticks(example.start, last, 10), label: "observation row t" };
   const wide = { width: 920, class: "wide" };
+  const drawn = (plot, twin, own) => [[twin, TWIN], [own, ANOMALOUS]].filter(([values]) => values)
+    .map(([values, kind]) => line(plot, values.map((_, i) => example.start + i), values, kind));
   const onset = (plot, text) => shape("g", { class: "onset" },
     shape("line", { x1: plot.sx(example.onset), x2: plot.sx(example.onset), y1: plot.top, y2: plot.bottom }),
     text && shape("text", { x: plot.sx(example.onset), y: plot.top - 6, "text-anchor": "middle" }, `onset \u03c4 = ${example.onset}`));
+  const shades = (plot) => shape("g", { class: "anomalous-rows" }, example.intervals.map(([start, stop]) => {
+    const [from, to] = [Math.max(start, example.start), Math.min(stop - 1, last)].map((t) => plot.sx(t));
+    return to < plot.left || from > plot.right || to < from ? null : shape("rect", {
+      class: start < 0 ? "unknown" : null, x: from, width: Math.max(1, to - from), y: plot.top, height: plot.bottom - plot.top,
+    });
+  }));
+  const anomalous = paired ? onset : shades;
 
-  const scoreAxis = axisOf([...example.scores, ...example.twin], 1, example.score_step, "score (s.d.)");
-  const cusumAxis = axisOf([...example.cusum, ...example.twin_cusum], DATA.threshold, example.cusum_step, "CUSUM");
+  const scoreAxis = axisOf([...example.scores, ...example.twin ?? []], 1, example.score_step, "score (s.d.)");
+  const cusumAxis = axisOf([...example.cusum, ...example.twin_cusum ?? []], DATA.threshold, example.cusum_step, "CUSUM");
   const scores = chart("Scores", { ...x, label: null }, scoreAxis, { ...wide, height: 210, top: 22 });
-  scores.drawing.append(onset(scores, true),
-    line(scores, rows(example.twin), example.twin, TWIN),
-    line(scores, rows(example.scores), example.scores, ANOMALOUS));
-
-  const cusum = chart("CUSUM statistic and alarms", x, cusumAxis, { ...wide, height: 250, bottom: 84 });
-  cusum.drawing.append(onset(cusum, false),
+  scores.drawing.append(anomalous(scores, true), ...drawn(scores, example.twin, example.scores));
+  const cusum = chart("CUSUM statistic and alarms", x, cusumAxis, { ...wide, height: paired ? 250 : 240, bottom: paired ? 84 : 74 });
+  cusum.drawing.append(anomalous(cusum, false),
     shape("line", { class: "threshold", x1: cusum.left, x2: cusum.right, y1: cusum.sy(DATA.threshold), y2: cusum.sy(DATA.threshold) }),
-    line(cusum, rows(example.twin_cusum), example.twin_cusum, TWIN),
-    line(cusum, rows(example.cusum), example.cusum, ANOMALOUS),
-    alarmStrip(cusum, example.alarms, ANOMALOUS, 26), alarmStrip(cusum, example.twin_alarms, TWIN, 40));
+    ...drawn(cusum, example.twin_cusum, example.cusum), alarmStrip(cusum, example.alarms, ANOMALOUS, 26),
+    ...paired ? [alarmStrip(cusum, example.twin_alarms, TWIN, 40)] : []);
 
-  const bending = Boolean(scoreAxis.bend || cusumAxis.bend);
   const first = (alarms) => {
     const found = alarms.find((t) => t >= example.onset);
     return found === undefined ? "none in this window" : found === example.onset ? "at the onset" : `${found - example.onset} step${found === example.onset + 1 ? "" : "s"} after the onset`;
@@ -211,43 +219,16 @@ function trajectoryFigure(example, sensors = null) {
       reveals.push(revealer(plot));
     }
   }, (error) => above.append(notLoaded(error)));
-  const area = example.auc_matched === null ? "undefined" : `${show(example.auc_matched, "percent")} %`;
+  const area = paired ? example.auc_matched : example.auc_pool;
+  const spans = example.intervals?.map(([start, stop]) => start < 0 ? `up to ${stop - 1}, from an unknown row on` : `${start} to ${stop - 1}`);
+  const labelled = !spans ? "" : spans.length ? `Anomalous rows, shaded: ${spans.join("; ")}. ` : "Which of its rows are anomalous is not known. ";
+  const alarms = paired ? ` First alarm from the onset on: anomalous ${first(example.alarms)}, twin ${first(example.twin_alarms)}.` : "";
   return [controls, above ?? [], figure([scores.drawing, cusum.drawing],
-    [[ANOMALOUS, "anomalous trajectory"], [TWIN, "its nominal twin"], ["threshold", `alarm threshold ${DATA.threshold}`]],
-    `Test trajectory ${example.index}, the one with the median matched AUC (${area}) of this cell, rows ${example.start} to ${last} of ${example.length}. ` +
-    `Scores in standard deviations from the mean of the calibration scores; CUSUM statistic with drift ${DATA.drift}, before the reset that an alarm brings; marks below it are alarms. ` +
-    `First alarm from the onset on: anomalous ${first(example.alarms)}, twin ${first(example.twin_alarms)}.${bending ? " Where values are very large the upright scale is logarithmic." : ""}`)];
-}
-
-/** Scores and statistic of an episode without a twin, its anomalous rows shaded. */
-function episodeFigure(example) {
-  const last = example.start + example.scores.length - 1;
-  const rows = example.scores.map((_, i) => example.start + i);
-  const x = { range: [example.start, last], ticks: ticks(example.start, last, 10), label: "observation row t" };
-  const wide = { width: 920, class: "wide" };
-  const shades = (plot) => shape("g", { class: "anomalous-rows" }, example.intervals.map(([start, stop]) => {
-    const [from, to] = [Math.max(start, example.start), Math.min(stop - 1, last)].map((t) => plot.sx(t));
-    return to < plot.left || from > plot.right || to < from ? null : shape("rect", {
-      class: start < 0 ? "unknown" : null, x: from, width: Math.max(1, to - from), y: plot.top, height: plot.bottom - plot.top,
-    });
-  }));
-  const scoreAxis = axisOf(example.scores, 1, example.score_step, "score (s.d.)");
-  const cusumAxis = axisOf(example.cusum, DATA.threshold, example.cusum_step, "CUSUM");
-  const scores = chart("Scores", { ...x, label: null }, scoreAxis, { ...wide, height: 210, top: 22 });
-  scores.drawing.append(shades(scores), line(scores, rows, example.scores, ANOMALOUS));
-  const cusum = chart("CUSUM statistic and alarms", x, cusumAxis, { ...wide, height: 240, bottom: 74 });
-  cusum.drawing.append(shades(cusum),
-    shape("line", { class: "threshold", x1: cusum.left, x2: cusum.right, y1: cusum.sy(DATA.threshold), y2: cusum.sy(DATA.threshold) }),
-    line(cusum, rows, example.cusum, ANOMALOUS), alarmStrip(cusum, example.alarms, ANOMALOUS, 26));
-  const area = example.auc_pool === null ? "undefined" : `${show(example.auc_pool, "percent")} %`;
-  const spans = example.intervals.map(([start, stop]) => start < 0 ? `up to ${stop - 1}, from an unknown row on` : `${start} to ${stop - 1}`);
-  const labelled = spans.length ? `Anomalous rows, shaded: ${spans.join("; ")}. ` : "Which of its rows are anomalous is not known. ";
-  const bending = Boolean(scoreAxis.bend || cusumAxis.bend);
-  return [player(example, [revealer(scores), revealer(cusum)]), figure([scores.drawing, cusum.drawing],
-    [[ANOMALOUS, "anomalous episode"], ["threshold", `alarm threshold ${DATA.threshold}`]],
-    `Test episode ${example.index}, the one with the median pooled AUC (${area}) of this cell, rows ${example.start} to ${last} of ${example.length}. ${labelled}` +
-    `Scores in standard deviations from the mean of the calibration scores; CUSUM statistic with drift ${DATA.drift}, before the reset that an alarm brings; marks below it are alarms.` +
-    `${bending ? " Where values are very large the upright scale is logarithmic." : ""}`)];
+    [[ANOMALOUS, `anomalous ${paired ? "trajectory" : "episode"}`], ...paired ? [[TWIN, "its nominal twin"]] : [], ["threshold", `alarm threshold ${DATA.threshold}`]],
+    `Test ${paired ? "trajectory" : "episode"} ${example.index}, the one with the median ${paired ? "matched" : "pooled"} AUC (${area === null ? "undefined" : `${show(area, "percent")} %`}) of this cell, ` +
+    `rows ${example.start} to ${last} of ${example.length}. ${labelled}` +
+    `Scores in standard deviations from the mean of the calibration scores; CUSUM statistic with drift ${DATA.drift}, before the reset that an alarm brings; marks below it are alarms.${alarms}` +
+    `${scoreAxis.bend || cusumAxis.bend ? " Where values are very large the upright scale is logarithmic." : ""}`)];
 }
 
 /** Marks below a chart, one for each alarm. */

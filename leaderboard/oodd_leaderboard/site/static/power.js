@@ -77,13 +77,9 @@ function powerOf(suite) {
 const powerLine = (plot, row, axis, kind) =>
   line(plot, row.points.map((p) => (axis.bend ? 1 : 100) * p[axis.place]), row.points.map((p) => 100 * p[2]), kind);
 
-function powerTable(table, i) {
-  const [first, ...others] = table.header;
+function powerTable({ title, note, header, rows }, i) {
   const id = `power-table-${i}`;
-  return element("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": table.title },
+  return element("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": title },
     csvButton(`thresholds-${i + 1}`, () => document.getElementById(id)),
-    element("table", { class: "plain", id }, captionOf(`${table.title}. ${table.note}`),
-      element("thead", {}, element("tr", {}, element("th", { scope: "col", class: "left" }, first), others.map((text) => element("th", { scope: "col" }, text)))),
-      element("tbody", {}, table.rows.map(([label, ...cells]) =>
-        element("tr", {}, element("th", { scope: "row" }, label), cells.map((text) => element("td", {}, text)))))));
+    tableOf({ class: "plain", id }, `${title}. ${note}`, header, rows.map(([label, ...cells]) => lineOf(label, cells))));
 }

@@ -21,7 +21,7 @@ function restore(text) {
   const known = {
     board: (v) => DATA.boards.some((b) => b.id === v),
     group: (v) => Object.hasOwn(GROUP_TITLES, v),
-    view: (v) => Object.hasOwn(LISTS, v) || Object.hasOwn(LISTS_OF_LOGS, v),
+    view: (v) => Object.hasOwn(LISTS, v),
   };
   for (const [name, usual] of Object.entries(DEFAULTS)) {
     const value = given.get(name);
@@ -72,7 +72,11 @@ function once(of) {
   };
 }
 
-const rankOfView = () => listOf(currentBoard(), state.view).rank ?? RANK;
+/** The ranks that stand in a view. */
+function rankOfView(board = currentBoard()) {
+  const rank = listOf(board, state.view).rank ?? RANK;
+  return board.paired || rank === RANK ? rank : { ...rank, hint: "1 plus the number of rows that are significantly better by the first column" };
+}
 
 /** The key of the column that the table is sorted by; on a first visit that of the metric that ranks. */
 const sortKey = (board) => state.sort === DEFAULTS.sort ? board.ranking : state.sort;
@@ -297,7 +301,7 @@ function what(board, rows) {
     : state.group === "all" ? "all anomalies" : `${state.group} anomalies`;
   const shown = rows.length === board.rows.length ? `${rows.length} rows` : `${rows.length} of ${board.rows.length} rows`;
   const { title: name, over, level } = listOf(board, state.view);
-  const title = level ? `${name} at ${level(board)}` : name;
+  const title = level && !board.paired ? `${name} at ${level(board)}` : name;
   return over ? `${title}: ${over} (${shown})`
     : `${title}: ${where}, ${anomalies} (means over ${cells} cell${cells === 1 ? "" : "s"}; ${shown})`;
 }
