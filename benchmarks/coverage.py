@@ -21,7 +21,7 @@ from oodd_eval.metrics.bootstrap import DrawnCells, drawn_cell, mean_interval
 from oodd_eval.metrics.catalogue import IntervalKind, metric_info
 from oodd_eval.metrics.recalibration import PairedScores, Recalibration
 from oodd_eval.metrics.unpaired import UnpairedScores, separability
-from oodd_eval.results.draws import CodedDraws
+from oodd_eval.results.record import CodedDraws
 
 SEEDS: Final = (10, 20, 50)
 """Test seeds per environment: those of mini, reduced and standard."""

@@ -19,7 +19,7 @@ from oodd_eval import load_split
 from oodd_eval.data.baseline import Baseline
 from oodd_eval.errors import OoddError
 from oodd_eval.metrics.alarms import Calibration, rolling_rules
-from oodd_eval.metrics.drift import drift_test
+from oodd_eval.metrics.promise import drift_test
 from oodd_eval.plugins.contract import make_detector, score_chunk
 from oodd_eval.plugins.discovery import discover
 

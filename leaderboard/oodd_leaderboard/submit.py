@@ -14,12 +14,12 @@ from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, in_order
 from oodd_eval.data.files import compress_large, digests, remove_abandoned, temporary_directory
 from oodd_eval.errors import OutputError, UsageError
 from oodd_eval.names import counted, expression, select
-from oodd_eval.results.curve_file import make_curves, write_curves
 from oodd_eval.results.directory import RECORDS, ResultsDirectory
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
 from oodd_eval.results.standings import primary_settings
 from oodd_leaderboard import entry as stored
+from oodd_leaderboard.curve_file import make_curves, write_curves
 from oodd_leaderboard.entry import CURVES, ENTRY, SCORES, EntryInfo
 from oodd_leaderboard.verify import EntryVerdict, Neighbours, find_split, formats, verify_entry
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
-from oodd_eval.data.parts import CALIBRATION, TWINS, EnvironmentData, LabelledSet
+from oodd_eval.data.parts import CALIBRATION, TWINS, AnomalousSet, EnvironmentData, LabelledSet
 from oodd_eval.data.split import Split
 from oodd_eval.errors import MissingExtraError, ResultsError, UsageError
 from oodd_eval.metrics.alarms import GuaranteedAlarm
@@ -374,59 +374,40 @@ class Results(Sequence[Record]):
                 must_be_of(split, record)
                 data: EnvironmentData = opened(split)(record.environment)
                 file = stored_scores([record], self._directory, data)
-                sensors = tuple(sensor.name for sensor in data.sensors)
                 of_board = [r for r in self.records if Conditions.of(r) == Conditions.of(record)]
                 joining = file.parts[TWINS] if record.rolling else None
                 rules = Rules.fit(file.parts[CALIBRATION], record.alarm, joining)
                 level = level_of(of_board)
-                rule = rules.guaranteed.get(level)
-                if not data.paired:
-                    yield _without_twins(record, file, data, rule, level)
-                    continue
-                anomalous = data.anomalous(record.condition)
-                yield [
-                    ScoredEpisode(
-                        record.cell,
-                        i,
-                        scores,
-                        file.parts[TWINS][i],
-                        anomalous[i],
-                        data.twins[i],
-                        int(anomalous.onsets[i]),
-                        int(anomalous.effects[i]),
-                        sensors,
-                        rule,
-                    )
-                    for i, scores in enumerate(file.parts[record.condition.part])
-                ]
+                yield _scored(record, file, data, rules.guaranteed.get(level), level)
 
 
-def _without_twins(
+def _scored(
     record: Record, file: ScoreFile, data: EnvironmentData, rule: GuaranteedAlarm | None, level: str
 ) -> list[ScoredEpisode]:
-    """Return the episodes of a cell whose environment has no twins."""
+    """Return the episodes of a cell, beside their twins where there are some."""
     episodes = data.test_set(record.condition)
-    intervals = episodes.intervals if isinstance(episodes, LabelledSet) else [()] * len(episodes)
-    reference = data.twins if len(data.twins) else data.train
-    rows = np.concatenate([episode.observations for episode in reference])
-    nominal = np.array([rows.mean(axis=0, dtype=float), rows.std(axis=0, dtype=float)])
-    starts = [next((start for start, _ in one[:1] if start >= 0), None) for one in intervals]
+    scores, n = file.parts[record.condition.part], len(episodes)
+    nothing: Sequence[Any] = [None] * n
+    intervals: Sequence[Any] = [()] * n
+    twins, twin_scores, nominal = nothing, nothing, None
+    if isinstance(episodes, AnomalousSet):
+        twins, twin_scores = data.twins, file.parts[TWINS]
+        starts, effects = episodes.onsets.tolist(), episodes.effects.tolist()
+    else:
+        intervals = episodes.intervals if isinstance(episodes, LabelledSet) else intervals
+        starts = [next((start for start, _ in one[:1] if start >= 0), None) for one in intervals]
+        effects = starts
+        reference = data.twins if len(data.twins) else data.train
+        rows = np.concatenate([episode.observations for episode in reference])
+        nominal = np.array([rows.mean(axis=0, dtype=float), rows.std(axis=0, dtype=float)])
     sensors = tuple(sensor.name for sensor in data.sensors)
+    of_cell = {"sensors": sensors, "rule": rule, "nominal": nominal, "level": LEVELS[level]}
     return [
         ScoredEpisode(
-            record.cell,
-            i,
-            scores,
-            None,
-            episodes[i],
-            None,
-            starts[i],
-            starts[i],
-            sensors,
-            rule,
-            intervals[i],
-            nominal,
-            LEVELS[level],
+            *(record.cell, i, scores[i], twin_scores[i], episodes[i], twins[i]),
+            *(starts[i], effects[i]),
+            intervals=intervals[i],
+            **of_cell,
         )
-        for i, scores in enumerate(file.parts[record.condition.part])
+        for i in range(len(scores))
     ]

@@ -29,9 +29,8 @@ from oodd_eval.metrics.recalibration import Draws, PairedScores, Recalibration
 from oodd_eval.metrics.unpaired import UnpairedScores
 from oodd_eval.plugins.contract import ROLLOUT_TOLERANCE, TOLERANCE, Scores, difference
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
-from oodd_eval.results.draws import CodedDraws
 from oodd_eval.results.identity import Cell
-from oodd_eval.results.record import NAN, Metric, Record
+from oodd_eval.results.record import NAN, CodedDraws, Metric, Record
 
 
 @dataclass(frozen=True, slots=True)

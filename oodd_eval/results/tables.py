@@ -128,7 +128,7 @@ _ALARMS: Final = (
 )
 """Columns of a table of guaranteed alarms. The null of the longest span is the largest."""
 
-_PAPER: Final = ("delay", "delay_null", "delay_censored", "missed", "far", "far_twin")
+PAPERS: Final = ("delay", "delay_null", "delay_censored", "missed", "far", "far_twin")
 _PAPERS_NULLS: Final = ("delay_null", "far_twin")
 
 POOLED: Final = ("auc_pool", "auc_pool_null", "auc_rows")
@@ -211,7 +211,7 @@ class Tables:
 
     def papers(self) -> Table:
         """Return what the paper's alarm does, mean over cells, under a heading of its own."""
-        columns = self.columns(_PAPER)
+        columns = self.columns(PAPERS)
         note = explained({c.title: c.metric for c in columns if c.metric in _PAPERS_NULLS})
         return self.table(f"{PAPER} (delays in steps, the rest as shares)", columns, note)
 
@@ -297,7 +297,7 @@ class Tables:
         candidates = [self._headline(), self._outcomes(), self._nominal(), self._apart()]
         candidates += [self._headline([name]) for name in single]
         if self._present(ROWS):
-            candidates.append(self._of_logs(_OF_ROWS, ROWS))
+            candidates.append(self._of_logs(_PUBLISHED, ROWS))
         return [table for table in candidates if table]
 
     def _headline(self, environments: Sequence[str] = ()) -> Table | None:
@@ -411,7 +411,7 @@ class Tables:
 _BESIDE_MATCHED: Final = ("auc_smoothed", "auc_unpaired")
 _TABLE_5: Final = ("auc", "delay", "far")
 _NOMINAL: Final = ("false_episodes", "false_alarms_per_hour")
-_OF_ROWS: Final = "Metrics of rows, for comparison with published tables; they rank nothing"
+_PUBLISHED: Final = "Metrics of rows, for comparison with published tables; they rank nothing"
 _ATTRIBUTION: Final = (
     "Of the detectors that explain their scores, at the first guaranteed alarm: how often the "
     "sensor that they name first is a corrupted one, over sensor anomalies, and how far the onset "

@@ -30,8 +30,14 @@ from oodd_eval.metrics.alarms import (
     quantile_rank,
     rolling_rules,
 )
-from oodd_eval.metrics.drift import drift_test, permutation_test, two_sample_test
-from oodd_eval.metrics.promise import EpisodeMeans, achieved_share, enough_episodes
+from oodd_eval.metrics.promise import (
+    EpisodeMeans,
+    achieved_share,
+    drift_test,
+    enough_episodes,
+    permutation_test,
+    two_sample_test,
+)
 from oodd_eval.plugins.contract import make_detector
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.results.evaluate import rescore

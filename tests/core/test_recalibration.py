@@ -23,8 +23,7 @@ from oodd_eval.metrics.ranking import leads, rank
 from oodd_eval.metrics.recalibration import DRAWS, PairedScores, Recalibration, drawn, thresholds
 from oodd_eval.metrics.unpaired import UnpairedScores, unpaired_alarms
 from oodd_eval.results.board import standard_error
-from oodd_eval.results.draws import STEPS, CodedDraws
-from oodd_eval.results.record import Record
+from oodd_eval.results.record import STEPS, CodedDraws, Record
 
 
 def record(**changes):

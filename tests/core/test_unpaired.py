@@ -33,9 +33,8 @@ from oodd_eval.metrics.unpaired import (
     volume_under_pr,
 )
 from oodd_eval.results.board import boards
-from oodd_eval.results.draws import CodedDraws
 from oodd_eval.results.evaluate import counts_of
-from oodd_eval.results.record import Record
+from oodd_eval.results.record import CodedDraws, Record
 
 NAN = math.nan
 SCORE = GuaranteedAlarm(None, math.inf)

@@ -8,6 +8,7 @@ import helpers_site
 import numpy as np
 import pytest
 from oodd_leaderboard import site
+from oodd_leaderboard.curve_file import read_curves
 from oodd_leaderboard.entry import read_entries, sections
 from oodd_leaderboard.site.data import (
     WITH_INTERVALS,
@@ -25,7 +26,6 @@ from oodd_eval.data.facts import ENVIRONMENTS, TABLE1
 from oodd_eval.data.split import load_split
 from oodd_eval.errors import ResultsError
 from oodd_eval.metrics.catalogue import METRICS, NAMES, metric_info
-from oodd_eval.results.curve_file import read_curves
 
 STATIC = Path(site.__file__).parent / "static"
 

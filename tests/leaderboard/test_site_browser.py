@@ -7,12 +7,12 @@ import urllib.parse
 import helpers_site
 import pytest
 from oodd_leaderboard import site
+from oodd_leaderboard.curve_file import read_curves
 from oodd_leaderboard.entry import read_entries, sections
 from oodd_leaderboard.site.data import site_data
 
 from oodd_eval.data.facts import ANOMALIES
 from oodd_eval.metrics.catalogue import METRICS
-from oodd_eval.results.curve_file import read_curves
 from oodd_eval.results.strengths import DETECTION
 from oodd_eval.results.tables import show_value
 

@@ -11,6 +11,8 @@ from helpers_records import make_record
 from helpers_submission import Draft
 from oodd_leaderboard import published, site
 from oodd_leaderboard.build import build, differences
+from oodd_leaderboard.curve_file import check_curves, read_curves
+from oodd_leaderboard.curves import pooled_roc
 from oodd_leaderboard.entry import read_entries, sections
 from oodd_leaderboard.submit import Statement, submit
 from oodd_leaderboard.verify import verify_entry
@@ -22,9 +24,7 @@ from oodd_eval.data.layout import own_facts, write_environment, write_manifest
 from oodd_eval.data.split import Split
 from oodd_eval.errors import ResultsError, UsageError
 from oodd_eval.metrics.alarms import GuaranteedAlarm
-from oodd_eval.metrics.curves import pooled_roc
 from oodd_eval.metrics.unpaired import UnpairedScores, separability
-from oodd_eval.results.curve_file import check_curves, read_curves
 
 ROWS = ("clock", "mahalanobis", "persistence", "random", "range")
 """The rows of the board: they need no library and take no time."""

@@ -24,34 +24,20 @@ from oodd_eval.metrics.bootstrap import nan_mean
 from oodd_eval.metrics.catalogue import HEADLINE, METRICS, NAMES, RANKING, metric_info
 from oodd_eval.metrics.cusum import DRIFT, THRESHOLD
 from oodd_eval.results.board import Board, grouped
-from oodd_eval.results.curve_file import read_curves
 from oodd_eval.results.record import NAN, Record
 from oodd_eval.results.report import findings_of
 from oodd_eval.results.standings import Standing
 from oodd_eval.results.strengths import COSTS, DETECTION, Strengths, curve
-from oodd_eval.results.tables import missing_level
+from oodd_eval.results.tables import PAPERS, POOLED, missing_level
+from oodd_leaderboard.curve_file import read_curves
 from oodd_leaderboard.entry import LeaderboardSection, SubmittedEntry, SuiteSection, commands_of
 
 _COMPARED: Final = (
-    "false_episodes",
-    "early",
-    "delay",
-    "delay_censored",
-    "missed",
-    "found_within_20",
-    "found_within_100",
+    *("false_episodes", "early", "delay", "delay_censored", "missed"),
+    *("found_within_20", "found_within_100"),
 )
 WITH_INTERVALS: Final = (
-    "auc_matched",
-    "auc_smoothed",
-    "auc_unpaired",
-    "auc",
-    "delay",
-    "delay_null",
-    "delay_censored",
-    "missed",
-    "far",
-    "far_twin",
+    *("auc_matched", "auc_smoothed", "auc_unpaired", "auc", *PAPERS),
     *(f"{name}_{HEADLINE}" for name in _COMPARED),
 )
 """Metrics that have intervals on the site: those that comparisons are made with."""
@@ -62,13 +48,9 @@ SUMMARIES: Final = ("all|all", "all|sensor", "all|dynamics")
 ENTRY_FIELDS: Final = ("id", "title", "submitter", "created", "citation", "url", "caption")
 """Fields of an entry that the site shows."""
 
-_OF_LOGS: Final = ("auc_pool", "auc_pool_null", "auc_rows", "auc_outcome")
+_OF_LOGS: Final = (*POOLED, "auc_outcome")
 _ALARMS_OF_LOGS: Final = (
-    *_COMPARED,
-    "events_found",
-    "false_alarms_per_hour",
-    "found_outcome",
-    "found_outcome_null",
+    *(*_COMPARED, "events_found", "false_alarms_per_hour", "found_outcome", "found_outcome_null"),
 )
 """Metrics with intervals where episodes have no twins; those of alarms at the board's level."""
 
@@ -124,25 +106,24 @@ def _power(section: SuiteSection) -> Json:
     Points are (strength, share of the return lost, value), the weakest strength first.
     """
     board, tables = section.board, section.tables[:2]
-    by_name = {str(row): row for row in board.entries}
-    rows = [by_name[line[0]] for line in tables[0].rows] if tables else []
-    records = grouped(board.records, lambda r: r.setting)
-    metrics = [metric_info(name) for name in (DETECTION, RANKING)]
+    rows = {str(row): row for row in board.entries}
+    records = grouped(board.records, lambda r: str(r.setting))
+    metrics = DETECTION, RANKING
     return {
         **_fields(board, "split", "digest"),
         "unit": COSTS.get(Strengths.of(board.records).base, ""),
         "tables": [_fields(table, "title", "header", "rows", "note") for table in tables],
-        "metrics": [_metric(info.name) | {"chance": info.name == RANKING} for info in metrics],
+        "metrics": [_metric(name) | {"chance": name == RANKING} for name in metrics],
         "rows": [
             {
-                "label": str(row),
-                "trivial": board.is_trivial(row),
+                "label": label,
+                "trivial": board.is_trivial(rows[label]),
                 "points": [
-                    [[*map(_short, point)] for point in curve(records[row], info.name)]
-                    for info in metrics
+                    [[*map(_short, point)] for point in curve(records[label], name)]
+                    for name in metrics
                 ],
             }
-            for row in rows
+            for label, *_ in (tables[0].rows if tables else ())
         ],
     }
 
@@ -384,17 +365,14 @@ def _intervals(
     """
     metrics = _with_intervals(names, board)
     intervals: dict[str, list[list[float | None] | None]] = {}
-    few = {key: cells for key, cells in chosen.items() if key in SUMMARIES}
-    for i, metric in enumerate(metrics):
-        selected = chosen if metric == board.ranking else few
-        several = {
-            k: cells for k, cells in selected.items() if len(cells) > 1 or standing.seeds > 1
-        }
-        for key, cells in several.items():
-            mean = board.mean(standing.entry, *_sides(cells), metric, intervals=True)
-            if not math.isnan(mean.low):
-                bounds = [_printed(v, metric_info(metric).unit) for v in (mean.low, mean.high)]
-                intervals.setdefault(key, [None] * len(metrics))[i] = bounds
+    for (i, metric), (key, cells) in product(enumerate(metrics), chosen.items()):
+        selected = metric == board.ranking or key in SUMMARIES
+        if not selected or len(cells) == standing.seeds == 1:
+            continue
+        mean = board.mean(standing.entry, *_sides(cells), metric, intervals=True)
+        if not math.isnan(mean.low):
+            bounds = [_printed(v, metric_info(metric).unit) for v in (mean.low, mean.high)]
+            intervals.setdefault(key, [None] * len(metrics))[i] = bounds
     return intervals
 
 

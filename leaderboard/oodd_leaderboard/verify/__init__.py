@@ -19,8 +19,8 @@ from oodd_eval.data.files import UNFINISHED, forms
 from oodd_eval.data.split import Split, load_split, published_digests
 from oodd_eval.errors import ResultsError, SplitError, UnknownNameError, UsageError
 from oodd_eval.results.board import defined_cells
-from oodd_eval.results.curve_file import check_curves
 from oodd_eval.results.directory import RECORDS
+from oodd_leaderboard.curve_file import check_curves
 from oodd_leaderboard.entry import (
     CURVES,
     ENTRY,

@@ -27,9 +27,8 @@ from oodd_eval.metrics.ranking import Position
 from oodd_eval.plugins import contract
 from oodd_eval.results.board import contribution, defined_cells, ranked_by
 from oodd_eval.results.directory import EXPLAINED, RECORDS, ResultsDirectory
-from oodd_eval.results.draws import CodedDraws
 from oodd_eval.results.evaluate import counts_of, early_difference, metric_of, rescore
-from oodd_eval.results.record import Metric, Record
+from oodd_eval.results.record import CodedDraws, Metric, Record
 from oodd_leaderboard.entry import SCORES, EntryInfo
 from oodd_leaderboard.verify.files import Findings, plain, short
 

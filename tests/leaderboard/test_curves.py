@@ -10,12 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-
-from oodd_eval import evaluate
-from oodd_eval.data.split import load_split
-from oodd_eval.errors import ResultsError
-from oodd_eval.metrics.auc import AlarmRule, alarm_contributions, auc, auc_contributions
-from oodd_eval.metrics.curves import (
+from oodd_leaderboard.curve_file import check_curves, make_curves, read_curves, write_curves
+from oodd_leaderboard.curves import (
     FPR,
     Sweep,
     delay_far,
@@ -25,8 +21,12 @@ from oodd_eval.metrics.curves import (
     rounded,
     thresholds,
 )
+
+from oodd_eval import evaluate
+from oodd_eval.data.split import load_split
+from oodd_eval.errors import ResultsError
+from oodd_eval.metrics.auc import AlarmRule, alarm_contributions, auc, auc_contributions
 from oodd_eval.metrics.cusum import THRESHOLD, UNIT, Standardization, cusum
-from oodd_eval.results.curve_file import check_curves, make_curves, read_curves, write_curves
 from oodd_eval.results.directory import ResultsDirectory
 
 RULE = AlarmRule(Standardization(mean=0.0, std=1.0))

@@ -1,6 +1,6 @@
 """The file ``curves.json``: made from stored scores, written, and read with every field checked.
 
-`_layout` has its fields; `oodd_eval.metrics.curves` computes them and says what they mean.
+`_layout` has its fields; `oodd_leaderboard.curves` computes them and says what they mean.
 """
 
 import functools
@@ -19,11 +19,11 @@ from oodd_eval.data.parts import CALIBRATION, TWINS
 from oodd_eval.data.split import Split
 from oodd_eval.errors import ResultsError
 from oodd_eval.metrics.auc import AlarmRule
-from oodd_eval.metrics.curves import Sweep, cell_curves, thresholds
 from oodd_eval.metrics.cusum import Standardization
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.evaluate import cell_scores, must_be_of, stored_scores
 from oodd_eval.results.record import Record
+from oodd_leaderboard.curves import Sweep, cell_curves, thresholds
 
 SCHEMA: Final = 1  # version of the layout; a reader refuses others
 LONGEST: Final = 1000  # most numbers in any list: a page that embeds them has to stay small
