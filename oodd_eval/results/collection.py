@@ -401,13 +401,10 @@ def _scored(
         rows = np.concatenate([episode.observations for episode in reference])
         nominal = np.array([rows.mean(axis=0, dtype=float), rows.std(axis=0, dtype=float)])
     sensors = tuple(sensor.name for sensor in data.sensors)
-    of_cell = {"sensors": sensors, "rule": rule, "nominal": nominal, "level": LEVELS[level]}
     return [
         ScoredEpisode(
             *(record.cell, i, scores[i], twin_scores[i], episodes[i], twins[i]),
-            *(starts[i], effects[i]),
-            intervals=intervals[i],
-            **of_cell,
+            *(starts[i], effects[i], sensors, rule, intervals[i], nominal, LEVELS[level]),
         )
         for i in range(len(scores))
     ]
