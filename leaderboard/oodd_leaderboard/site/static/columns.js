@@ -99,12 +99,12 @@ const rankingColumns = (board, parts) => [metricColumn(board, board.ranking), ..
 
 const ROW_METRICS = ["f1_rows", "far_rows", "mar_rows", "vus_pr"];
 const BESIDE_RANKING = ["auc_pool", "auc_pool_null", "auc_rows", "auc_outcome", "auc_smoothed", "auc_unpaired", "auc", "auc_placebo"];
-const OF_ALARMS = ["delay_censored", "found_outcome", "found_outcome_null", "events_found", "delay", "missed", "found_within_20",
-  "found_within_100", "found_within_100_null", "false_episodes", "early", "false_alarms_per_hour"];
-const AT_OTHER_LEVELS = {
-  true: ["delay", "missed", "found_within_20", "found_within_100", "found_within_100_null", "false_episodes", "early"],
-  false: ["delay", "missed", "false_episodes"],
+const WITHIN = ["found_within_20", "found_within_100", "found_within_100_null"];
+const OF_ALARMS = {
+  true: ["delay_censored", "delay", "missed", ...WITHIN, "false_episodes", "early"],
+  false: ["delay_censored", "found_outcome", "found_outcome_null", "events_found", "delay", "missed", ...WITHIN, "false_episodes", "early", "false_alarms_per_hour"],
 }; // by whether episodes are paired
+const AT_OTHER_LEVELS = { true: OF_ALARMS.true.slice(1), false: ["delay", "missed", "false_episodes"] };
 
 /** The views: a board leaves out columns that it has no numbers for, and views that are `only` of the other kind. */
 const LISTS = {
@@ -134,7 +134,7 @@ const LISTS = {
     sort: "alarm_rank",
     level: levelOf,
     columns: (board) => metricColumns(board, [
-      ...OF_ALARMS.map((metric) => `${metric}_${board.level}`),
+      ...OF_ALARMS[board.paired].map((metric) => `${metric}_${board.level}`),
       ...["at_5pct", "at_10pct", "at_1pct"].filter((suffix) => suffix !== board.level)
         .flatMap((suffix) => AT_OTHER_LEVELS[board.paired].map((metric) => `${metric}_${suffix}`)),
     ]),

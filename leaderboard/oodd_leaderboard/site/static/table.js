@@ -306,6 +306,15 @@ function what(board, rows) {
     : `${title}: ${where}, ${anomalies} (means over ${cells} cell${cells === 1 ? "" : "s"}; ${shown})`;
 }
 
+/** Sentences below a table that has such rows. */
+const NOTES = [
+  [(row) => row.below, "Ranked are rows that maintainers have run again on seeds of their own. The others stand below, in brackets the rank that they would have, and push no row down."],
+  [(row) => row.clone_of, "A row with = and another\u2019s name has that row\u2019s scores. It has the same rank, and pushes no other row down."],
+  [isTrainedOnMore, "Rows trained on more than nominal trajectories of the split are not ranked."],
+  [(row) => row.training === "oracle", "An oracle has the true equations of the environment. It says how far the limit is, and is not ranked."],
+  [(row) => row.lead && isSummary(state), "Lead: in how many of the cases in which one environment is left out the row\u2019s mean stays above that of the next rank."],
+];
+
 /** What has to stand below a table. */
 function notesOf(board, rows) {
   const limit = board.limit === null ? "" : `, limited to the first ${board.limit} trajectories of each part: for trying only`;
@@ -314,36 +323,14 @@ function notesOf(board, rows) {
     `${board.paired ? `${board.tests.join(", ")} test seeds per environment` : "episodes without twins"}${limit}. Tables never mix splits or protocols.`,
     `Trust: ${trustsOf(board).map((trust) => `${trust}, ${TRUST[trust]}`).join("; ")}.`,
     ...board.about,
+    selectsLess(state) && "Ranks, tie groups and wins are those over all cells of the board, whatever is selected.",
+    !isSummary(state) && `Over single environments or anomalies only ${rankingName(board)} has intervals here; every detector's page has those of single cells.`,
+    ...NOTES.map(([applies, sentence]) => rows.some(applies) && sentence),
+    ...rows.filter((row) => row.state).map((row) => `Not ranked: ${row.label}, ${row.state}.`),
+    ...[...groupedBy(rows.filter((row) => row.caption), (row) => row.caption)].map(([caption, own]) => `${own.map((row) => row.label).join(", ")}: ${caption}`),
+    rows.some((row) => mean(board, row, board.ranking, state).partial) && "* A mean over fewer cells than other rows have.",
   ];
-  if (selectsLess(state)) {
-    lines.push("Ranks, tie groups and wins are those over all cells of the board, whatever is selected.");
-  }
-  if (!isSummary(state)) {
-    lines.push(`Over single environments or anomalies only ${rankingName(board)} has intervals here; every detector's page has those of single cells.`);
-  }
-  if (rows.some((r) => r.below)) {
-    lines.push("Ranked are rows that maintainers have run again on seeds of their own. The others stand below, in brackets the rank that they would have, and push no row down.");
-  }
-  if (rows.some((r) => r.clone_of)) {
-    lines.push("A row with = and another’s name has that row’s scores. It has the same rank, and pushes no other row down.");
-  }
-  if (rows.some(isTrainedOnMore)) {
-    lines.push("Rows trained on more than nominal trajectories of the split are not ranked.");
-  }
-  if (rows.some((r) => r.training === "oracle")) {
-    lines.push("An oracle has the true equations of the environment. It says how far the limit is, and is not ranked.");
-  }
-  if (isSummary(state) && rows.some((r) => r.lead)) {
-    lines.push("Lead: in how many of the cases in which one environment is left out the row’s mean stays above that of the next rank.");
-  }
-  for (const row of rows.filter((r) => r.state)) lines.push(`Not ranked: ${row.label}, ${row.state}.`);
-  for (const [caption, own] of groupedBy(rows.filter((row) => row.caption), (row) => row.caption)) {
-    lines.push(`${own.map((row) => row.label).join(", ")}: ${caption}`);
-  }
-  if (rows.some((row) => mean(board, row, board.ranking, state).partial)) {
-    lines.push("* A mean over fewer cells than other rows have.");
-  }
-  return lines.map((line) => element("li", {}, line));
+  return lines.filter(Boolean).map((line) => element("li", {}, line));
 }
 
 const selectsLess = (selection) => Object.keys(EVERYTHING).some((name) => selection[name] !== "all");
