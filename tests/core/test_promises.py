@@ -263,6 +263,9 @@ def test_the_share_of_later_calibration_episodes_is_set_beside_the_promise():
     assert loud.doubt
     assert "of the 20 later calibration episodes alarm" in loud.text
     assert achieved_share(steady[:17], "score") is None
+    # The 19th of 20 earlier ones is the threshold of 10 %: what reaches it does not alarm.
+    equal = achieved_share([np.array([float(k)]) for k in [*range(1, 21), *[19] * 20]], "score")
+    assert equal.text.startswith("0 of the 20 later")
 
 
 def test_the_chance_of_so_many_later_alarms_is_that_of_random_orders():

@@ -80,25 +80,37 @@ def test_ranks_do_not_depend_on_any_order():
     assert list(rank(turned).ranks) == list(rank(rows).ranks)
 
 
+def studentized(sample, centre=0.0):
+    """Mean of a sample from a centre, in standard errors."""
+    n, shift = len(sample), sum(sample) / len(sample) - centre
+    spread = sum((x - sum(sample) / n) ** 2 for x in sample) / (n - 1) / n
+    if abs(shift) < 1e-12:
+        return 0.0
+    return shift / math.sqrt(spread) if spread > 1e-20 else math.copysign(math.inf, shift)
+
+
+def counted_out(differences):
+    """Share of all resamples that are as far from the mean as it is from 0."""
+    resamples = itertools.product(differences, repeat=len(differences))
+    reached = [studentized(s, differences.mean()) >= studentized(differences) for s in resamples]
+    return sum(reached) / len(reached)
+
+
 def test_p_value_is_that_of_all_resamples_counted_out():
     differences = np.array([0.3, 0.1, -0.1, 0.2, 0.25, 0.05])
-    n = len(differences)
-
-    def studentized(sample, centre):
-        spread = sum((x - sum(sample) / n) ** 2 for x in sample) / (n - 1) / n
-        shift = sum(sample) / n - centre
-        if abs(shift) < 1e-12:
-            return 0.0
-        return shift / math.sqrt(spread) if spread > 1e-20 else math.copysign(math.inf, shift)
-
-    observed = studentized(differences, 0.0)
-    resamples = itertools.product(differences, repeat=n)
-    reached = [studentized(s, differences.mean()) >= observed for s in resamples]
-    expected = sum(reached) / len(reached)
+    expected, n = counted_out(differences), len(differences)
     ranking = rank({"a": row(differences + 0.5), "b": row([0.5] * n)}, resamples=20_000)
-    found = p_of(ranking, "a", "b").p
     assert 2.0**-n < expected < 0.2
-    assert found == pytest.approx(expected, abs=4 * math.sqrt(expected / 20_000))
+    error = 4 * math.sqrt(expected / 20_000)
+    assert p_of(ranking, "a", "b").p == pytest.approx(expected, abs=error)
+    # Of detector seeds alone, where all test seeds agree.
+    values, shifts = np.linspace(0, 1, 30), np.array([0.1, 0.2, 0.6, 0.15])
+    seeds = {k: row(values + shift)[0] for k, shift in enumerate(shifts)}
+    found = p_of(rank({"a": seeds, "b": row(values)}, resamples=20_000), "a", "b").p
+    assert found == pytest.approx(counted_out(shifts), abs=error)
+    # Where four test seeds differ by the same, each might as well have the other sign.
+    four = rank({"a": row(values[:4] + 0.2), "b": row(values[:4])}, resamples=2000)
+    assert p_of(four, "a", "b").p == 2.0**-4
 
 
 def test_interval_of_a_difference_is_the_paired_one():
