@@ -105,7 +105,7 @@ def checked(parts, **options):
     ("row", "change", "streamed", "refused"),
     [
         (2, 0.5, False, True), (2, 1e-12, True, True), (2, 1e-12, False, False),
-        (4, 0.5, True, False), (0, 7.0, True, True),
+        (3, 0.5, True, True), (4, 0.5, True, False), (0, 7.0, True, True),
     ],
 )  # fmt: skip
 def test_scores_before_the_effect_are_those_of_the_twin(row, change, streamed, refused):
