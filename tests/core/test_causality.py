@@ -136,14 +136,12 @@ class KnowsTheEnd(Magnitude):
         return scores * (1.0 + scores.sum())
 
 
-def test_an_honest_detector_passes(tiny_split):
-    records = evaluate(Magnitude, tiny_split, environments="hopper")
-    assert {r.status for r in records} == {"ok"}
-
-
-@pytest.mark.parametrize("wrong", [Centred, InCompany, KnowsTheEnd])
-def test_look_ahead_is_found_by_the_twin(tiny_split, wrong):
-    records = evaluate(wrong, tiny_split, environments="hopper")
+@pytest.mark.parametrize("detector", [Magnitude, Centred, InCompany, KnowsTheEnd])
+def test_look_ahead_is_found_by_the_twin(tiny_split, detector):
+    records = evaluate(detector, tiny_split, environments="hopper", anomalies="iid,gravity")
+    if detector is Magnitude:
+        assert {r.status for r in records} == {"ok"}
+        return
     assert {r.status for r in records} == {"invalid"}
     assert all("not those of its twin" in r.reason and not r.metrics for r in records)
 
@@ -151,6 +149,6 @@ def test_look_ahead_is_found_by_the_twin(tiny_split, wrong):
 def test_alarms_alone_give_a_look_ahead_away(tmp_path, monkeypatch):
     monkeypatch.setattr("oodd_eval.results.evaluate.check_before_effect", lambda *_, **__: None)
     split = make_split(tmp_path / "split", ("cartpole",), calibration=20)
-    records = evaluate(KnowsTheEnd, split)
+    records = evaluate(KnowsTheEnd, split, anomalies="iid")
     assert {r.status for r in records} == {"invalid"}
     assert "early_null" in records[0].reason
