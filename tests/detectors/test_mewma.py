@@ -117,10 +117,8 @@ def test_mahalanobis_distance_by_hand():
     correlated = whitening(np.array([[1.0, 0.5], [0.5, 1.0]]), 1e-12)
     np.testing.assert_allclose(far, [1.0])
     np.testing.assert_allclose(distance(np.array([[1.0, 1.0]]), correlated), [(4 / 3) ** 0.5])
-
-
-def test_shrinkage_bounds_the_share_of_a_constant_sensor():
-    # Shrunk variance 0.05 * 1: a residual of 1 is 1 / sqrt(0.05) long.
+    # Shrinkage bounds the share of a constant sensor: of variance 0.05 * 1 a residual of 1 is
+    # 1 / sqrt(0.05) long.
     root = whitening(np.diag([1.0, 0.0]), 0.05)
     np.testing.assert_allclose(distance(np.array([[0.0, 1.0]]), root), [0.05**-0.5])
 
@@ -161,13 +159,9 @@ def test_standardization_holds_on_trajectories_that_fit_has_not_seen():
     scores = np.concatenate([detector.score(episode(s))[1:] for s in range(500, 560)])
     assert abs(scores.mean()) < 0.15
     assert abs(scores.std() - 1) < 0.15
-
-
-def test_start_is_not_more_anomalous_than_the_rest():
-    """Nominal scores of an episode that starts like it goes on have no trend in time."""
-    episodes = [episode(s) for s in range(60)]
-    detector = make_mewma(order=2, weights=[0.03]).fit(episodes[:40])
-    scores = np.array([detector.score(x) for x in episodes[40:]])[:, 1:]
+    # An episode that starts as it goes on has no trend in time.
+    detector = make_mewma(order=2, weights=[0.03]).fit([episode(s) for s in range(40)])
+    scores = np.array([detector.score(episode(s)) for s in range(40, 60)])[:, 1:]
     assert abs(np.median(scores[:, 4:14]) - np.median(scores[:, -30:])) < 0.6
 
 
@@ -186,26 +180,20 @@ def test_small_persistent_change_shows_when_evidence_adds_up(chart_a):
     assert excess["chart"] > 3 * excess["memoryless"]
 
 
-def test_actions_explain_what_observations_cannot(chart, chart_a):
+def test_a_constant_sensor_is_seen_and_actions_explain_what_observations_cannot(chart, chart_a):
     assert chart_a.residual_scale_[2] < 0.4 * chart.residual_scale_[2]
-
-
-def test_constant_sensor_gives_no_residual_and_its_change_is_seen(chart):
-    assert chart.observation_scale_.std[3] == 1.0
-    assert chart.residual_scale_[3] == 1.0
+    assert chart.observation_scale_.std[3] == chart.residual_scale_[3] == 1.0
     x = episode(5)
     rows = x.observations.copy()
     rows[50:, 3] = 0.0
     assert chart.score(Trajectory(rows, x.actions))[55] > np.nanmax(chart.score(x)) + 1
 
 
-def test_a_live_chart_with_actions_asks_for_them():
-    made = make_mewma_a().fit(NOMINAL)
+def test_rows_without_actions_and_scales_of_zero_are_refused(chart_a):
+    made = make_mewma_a()
+    made.restore(chart_a.state())
     made.update(NOMINAL[0].observations[0])
     with pytest.raises(TrajectoryError, match=r"'mewma-a' was given an action None, expected"):
         made.update(NOMINAL[0].observations[1])
-
-
-def test_a_scale_of_zero_is_refused():
     scales = ["std", "action_scale", "residual_scale", "distance_std"]
-    assert_zero_scales_are_refused(make_mewma_a().fit(NOMINAL), make_mewma_a(), scales)
+    assert_zero_scales_are_refused(chart_a, make_mewma_a(), scales)

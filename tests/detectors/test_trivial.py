@@ -70,9 +70,7 @@ def test_persistence_is_the_mean_change_in_training_deviations():
     # |3 - 0| / 2 = 1.5 and |6 - 5| / 1 = 1: mean 1.25; then no change.
     scores = detector.score(episode([[0, 5], [3, 6], [3, 6]]))
     assert np.array_equal(scores, [np.nan, 1.25, 0.0], equal_nan=True)
-
-
-def test_persistence_looks_back_by_the_horizon():
+    # It looks back by the horizon.
     detector = Persistence(horizon=2)
     detector.fit([episode([[-1.0], [1.0]])])
     scores = detector.score(episode([[0.0], [1.0], [3.0], [3.0]]))
@@ -100,12 +98,9 @@ def scores_of(detector, *rows):
     return detector.score(episode(rows)).tolist()
 
 
-def test_range_knows_what_it_was_shown():
-    assert not fitted_range().score(episode(SEEN)).any()
-
-
 def test_range_adds_excess_in_spreads_and_values_never_seen():
     detector = fitted_range()
+    assert not detector.score(episode(SEEN)).any()
     found = scores_of(detector, [8.5, 0, 3], [-10, 1, 3], [7.5, 0, 3])
     assert found == pytest.approx([0.5 / SPREAD, 2 / SPREAD, 0])  # 7.5 was never seen, and may be
     std = SEEN[:, 1].std()
@@ -113,9 +108,7 @@ def test_range_adds_excess_in_spreads_and_values_never_seen():
     assert scores_of(detector, [0, 0.5, 3]) == [1]
     assert scores_of(detector, [0, 2, 3]) == pytest.approx([1 + 1 / std])
     assert scores_of(detector, [0, 1, 4]) == [2]
-
-
-def test_a_sensor_of_nine_values_is_not_discrete():
+    # A sensor of nine values is not discrete.
     eight, nine = (np.arange(n, dtype=float)[:, None] for n in (8, 9))
     assert scores_of(Range().fit([episode(eight)]), [2.5]) == [1]
     assert scores_of(Range().fit([episode(nine)]), [2.5]) == [0]
@@ -172,6 +165,11 @@ def test_manifold_sees_what_leaves_a_surface_and_no_single_sensor_shows():
     assert scores_of(plain, point)[0] < plain.score(episode(circle(9))).max()
     # A constant sensor that moves is not seen.
     assert scores_of(inside, [1, 0, 3]) == scores_of(inside, [1, 0, 4])
+    rows = np.random.default_rng(0).normal(size=(70, 61))
+    with pytest.raises(ContractError, match="got 61 sensors"):
+        Manifold().fit([episode(rows)])
+    with pytest.raises(FittedStateError, match="'range/1'"):
+        Mahalanobis().restore(Range().fit([WALK]).state())
 
 
 def test_manifold_is_the_length_of_whitened_products():
@@ -190,14 +188,3 @@ def test_manifold_is_the_length_of_whitened_products():
     far = (products((row - rows.mean(axis=0)) / rows.std(axis=0)) - mean) / std
     expected = np.sqrt(far @ np.linalg.solve(covariance, far))
     assert scores_of(detector, row)[0] == pytest.approx(expected, rel=1e-4)
-
-
-def test_manifold_refuses_more_sensors_than_it_can_multiply():
-    rows = np.random.default_rng(0).normal(size=(70, 61))
-    with pytest.raises(ContractError, match="got 61 sensors"):
-        Manifold().fit([episode(rows)])
-
-
-def test_a_baseline_does_not_take_over_the_fit_of_another():
-    with pytest.raises(FittedStateError, match="'range/1'"):
-        Mahalanobis().restore(Range().fit([WALK]).state())
