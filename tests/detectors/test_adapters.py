@@ -427,6 +427,26 @@ def test_adapters_run_beside_other_detectors(tmp_path, tiny_split, capsys):
     assert "sklearn:IsolationForest" in capsys.readouterr().out
 
 
+def test_adapters_are_submitted_and_verified_without_a_look_at_the_class(
+    tmp_path, tiny_split, theirs
+):
+    command = [
+        "run", "--detector", "forecast:their_models.Mean", "--env", "cartpole", "-q",
+        "--split", str(tiny_split), "--output", str(tmp_path / "out"), "--jobs", "1",
+    ]  # fmt: skip
+    assert main(command) == 0
+    submit = ["leaderboard", "submit", str(tmp_path / "out"), "--split", str(tiny_split)]
+    assert main([*submit, "--scores", "--results", str(tmp_path / "entries")]) == 0
+    # Results are data: verifying them imports nothing that they name.
+    theirs.write_text("raise SystemExit('imported')")
+    sys.modules.pop("their_models", None)
+    verify = ["leaderboard", "verify", str(tmp_path / "entries"), "--split", str(tiny_split)]
+    assert main(verify) == 0
+    (entry,) = (tmp_path / "entries").iterdir()
+    assert entry.name.startswith("forecast-their_models.mean-tiny")
+    assert not [p for p in entry.rglob("*") if ":" in p.name]
+
+
 @pytest.mark.parametrize(
     "name",
     ["sklearn:IsolationForest", "pyod:ECOD", "forecast:sklearn.linear_model.Ridge",

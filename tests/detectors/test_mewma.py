@@ -187,6 +187,9 @@ def test_a_constant_sensor_is_seen_and_actions_explain_what_observations_cannot(
     rows = x.observations.copy()
     rows[50:, 3] = 0.0
     assert chart.score(Trajectory(rows, x.actions))[55] > np.nanmax(chart.score(x)) + 1
+    # Residuals are clipped on both sides.
+    for sign in (-1, 1):
+        assert len({chart.score(shifted(x, 79, sign * by))[-1] for by in (1e3, 1e6)}) == 1
 
 
 def test_rows_without_actions_and_scales_of_zero_are_refused(chart_a):

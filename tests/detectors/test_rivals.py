@@ -55,6 +55,12 @@ def fitted():
 # All of them
 
 
+@pytest.mark.parametrize("name", ["rnd", "paano"])
+def test_the_seed_decides_what_is_learnt(name, fitted):
+    other = unfitted(name, seed=1).fit(NOMINAL)
+    assert (other.score(ODD) != fitted[name].score(ODD)).any()
+
+
 @pytest.mark.parametrize(
     ("name", "change"),
     [

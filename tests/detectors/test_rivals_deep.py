@@ -71,6 +71,12 @@ def test_zero_scales_in_a_state_are_refused(fitted, name):
 
 
 @pytest.mark.parametrize("name", ROWS)
+def test_the_seed_decides_what_is_learnt(fitted, name):
+    other = make(name, **SMALL, seed=1).fit(NOMINAL).score(NOMINAL[0])
+    assert not np.allclose(other[1:], fitted[name].score(NOMINAL[0])[1:])
+
+
+@pytest.mark.parametrize("name", ROWS)
 def test_a_constant_sensor_that_moves_adds_a_bounded_surprise(fitted, name):
     x = episode(105)
     rows = x.observations.copy()

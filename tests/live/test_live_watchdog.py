@@ -290,7 +290,7 @@ def test_a_class_makes_the_detector(tmp_path):
     watchdog.save(tmp_path / "scaled")
     loaded = Watchdog.load(tmp_path / "scaled", Scaled)
     assert (loaded._handle.detector.seed, loaded._handle.detector.scale) == (7, 2.0)
-    assert repr(loaded).startswith("Watchdog(Scaled, ")
+    assert repr(loaded) == f"Watchdog(Scaled, 3 sensors: {watchdog.promise})"
     with pytest.raises(UsageError, match="5 is no detector: expected a name"):
         Watchdog.fit(5, WIDE, CALIBRATION)
 

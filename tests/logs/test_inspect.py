@@ -11,8 +11,9 @@ from helpers_logs import write_table as write
 from oodd_logs.inspection.columns import ClockFacts, ColumnFacts, time_unit
 from oodd_logs.inspection.draft import draft, draft_recipe
 from oodd_logs.inspection.logs import inspect_logs
-from oodd_logs.inspection.report import advise, looks_like
+from oodd_logs.inspection.report import advise, describe_logs, looks_like
 from oodd_logs.recipe import Recipe
+from oodd_logs.scanning.logs import read_logs
 
 from oodd_eval.cli.main import main
 from oodd_eval.errors import TrajectoryError, UnknownNameError, UsageError
@@ -187,6 +188,8 @@ def test_blocks_count_as_the_whole_does():
 def test_units_of_stamps(tmp_path, name, stamps, unit):
     write(tmp_path / "a.csv", {name: stamps, "x": [1.5, 2.5]})
     assert inspect_logs(tmp_path).times == {name: unit}
+    if unit == "date":
+        assert draft_recipe(tmp_path).rate == 1
 
 
 def test_a_clock_that_falls_is_no_clock():
@@ -259,6 +262,14 @@ def test_a_first_recipe_cuts_faulty_files_only_where_labels_say_since_when(tmp_p
     assert (recipe.window, recipe.clock) == ((60, False) if labelled else (0, True))
     assert ("# window = 60 " in text) == (not labelled)
     assert ("once labels" in topics(logs)["few"]) == (not labelled)
+
+
+def test_a_scan_cuts_few_recordings_whatever_is_known_of_them(tmp_path):
+    for i in range(6):
+        folder = tmp_path / ("good" if i < 3 else "bad")
+        write(folder / f"run-{i}.csv", times(1000) | process(1000, i))
+    assert draft_recipe(tmp_path).window == 0
+    assert len(read_logs(tmp_path).episodes) == 6 * 1000 // 50
 
 
 def test_a_transposed_matrix_is_noticed_by_its_neighbours_and_read_as_it_is_meant(tmp_path):
@@ -389,9 +400,15 @@ def test_a_long_recording_takes_few_windows_and_bounded_memory(tmp_path):
     assert draft_recipe(path).window == rows // 100
 
 
-def test_the_command_prints_and_writes_a_recipe_that_is_read(clean, capsys, monkeypatch):
+def test_the_command_prints_and_writes_a_recipe_that_is_read(
+    clean, capsys, monkeypatch, tmp_path_factory
+):
     monkeypatch.chdir(clean.parent)
-    with_columns(clean, **PECULIAR)
+    logs = with_columns(clean, **PECULIAR)
+    for width in (80, 120):
+        lines = describe_logs(logs, width).splitlines()
+        assert max(map(len, lines)) <= width
+        assert not any(line.endswith(" ") for line in lines)
     recipe = clean.parent / "arm.toml"
     assert main(["data", "inspect", clean.name, "--recipe", "arm.toml"]) == 0
     assert "data import arm.toml" in capsys.readouterr().out
@@ -402,6 +419,12 @@ def test_the_command_prints_and_writes_a_recipe_that_is_read(clean, capsys, monk
     assert drafted.angles == ("angles",)
     assert drafted.missing == "hold"
     assert main(["data", "inspect", clean.name, "--recipe", "arm.toml"]) == 4
+    # A recipe elsewhere names the root.
+    elsewhere = tmp_path_factory.mktemp("recipes") / "arm.toml"
+    capsys.readouterr()
+    assert main(["data", "inspect", str(clean), "--recipe", str(elsewhere)]) == 0
+    assert f"--root {clean}" in capsys.readouterr().out
+    assert Recipe.load(elsewhere).nominal.files == ("*.csv",)
 
 
 @pytest.mark.parametrize(

@@ -80,6 +80,11 @@ def test_negligible_is_the_same_for_a_claim_and_its_opposite(half):
 def test_without_a_number_nothing_is_decided():
     assert ABOVE.verdict(Estimate(expected=7)) == "not run"
     assert ABOVE.verdict(Estimate(environments=7, expected=7)) == "undecided"
+    # A region is printed in the unit of its metric.
+    assert [ABOVE.describe("auc"), BETWEEN.describe("auc"), BELOW.describe("auc")] == [
+        "> 0", "between -2 and 2", "< 1",
+    ]  # fmt: skip
+    assert BETWEEN.describe("far") == "between -0.02 and 0.02"
 
 
 def records_of(world):

@@ -244,3 +244,5 @@ def test_figures_are_the_same_bytes_again_without_date_or_version():
     assert b"<dc:date>" not in first["svg"]
     assert b"Software" not in first["png"]
     assert draw(a_figure(height=3.0)) != first
+    text = first["svg"].decode()
+    assert all(word in text for word in ("A figure", "One", "RIQN", "AUC (%)", "hollow"))

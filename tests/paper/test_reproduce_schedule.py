@@ -8,6 +8,7 @@ from helpers_records import make_record
 from oodd_paper.experiments import EXPERIMENTS, TIERS
 from oodd_paper.run import (
     Progress,
+    duration,
     estimated_cost,
     lay_out,
     remaining_seconds,
@@ -95,6 +96,8 @@ def test_a_shared_fit_is_counted_once_and_a_kept_one_not_at_all():
     assert remaining_seconds(units, ROWS, ()) == pytest.approx(scoring + costs[0][0] + costs[2][0])
     assert remaining_seconds(units, ROWS, {"a"}) == pytest.approx(scoring + costs[2][0])
     assert remaining_seconds([], ROWS, ()) == 0
+    assert [duration(s) for s in (7.4, 600, 7260)] == ["7 s", "10 min", "2 h 01 min"]
+    assert estimated_cost(Setting("someone-elses"), "ant", 30_000)[0] > 0
     (fit, score), (same, more) = (estimated_cost(RIQN, "ant", n) for n in (30_000, 60_000))
     assert fit == same > 0
     assert more - 3 == pytest.approx(2 * (score - 3))

@@ -303,6 +303,10 @@ def test_a_fault_of_any_size_leaves_scores_finite(world, detectors):
 
 
 def test_worlds_are_told_by_their_columns_and_others_are_refused():
+    oracles = [s for s in oodd_detectors() if s.name.startswith("oracle")]
+    assert {(s.name, s.training, s.alarm, s.deterministic) for s in oracles} == {
+        ("oracle", "oracle", "score", True), ("oracle-gym", "oracle", "score", True),
+    }  # fmt: skip
     assert worlds() == {(30, 6): "arm", (18, 4): "drone", (6, 2): "tank"}
     strange = [Trajectory(np.zeros((5, 3)), np.zeros((4, 2)))] * 2
     with pytest.raises(NotImplementedError, match=r"arm \(30, 6\).*\(3, 2\).*--env arm,drone,tank"):
