@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from helpers_plugins import install
@@ -17,7 +18,7 @@ from oodd_eval.errors import SplitError, UsageError
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.plugins.isolation.child import Limits
 from oodd_eval.results.directory import ResultsDirectory
-from oodd_eval.scoring.executors import Executor, RunSettings, check_executor
+from oodd_eval.scoring.executors import Executor, RunSettings, check_executor, open_executor
 from oodd_eval.scoring.plan import make_plan
 from oodd_eval.scoring.unit import UnitJob
 
@@ -64,6 +65,12 @@ def ordered(job, tiny_split, limits=Limits(), stop=NEVER.is_set, **changes):  # 
 def test_an_executor_that_does_not_exist_is_refused(name):
     with pytest.raises(UsageError, match="expected 'local' or 'dask://HOST:PORT'"):
         check_executor(name)
+
+
+def test_a_cluster_takes_no_launcher_of_this_machine(tiny_split):
+    settings = RunSettings(executor="dask://h:1", launcher=SimpleNamespace())
+    with pytest.raises(UsageError, match="--sandbox is for workers of this machine"):
+        open_executor(settings, load_split(tiny_split), None)
 
 
 def test_an_order_is_json_and_gives_the_scores_of_a_local_unit(job, tiny_split):
