@@ -15,14 +15,15 @@ from oodd_eval.data.files import PACKED, compress, decompress, write_bytes, writ
 from oodd_eval.data.split import published_digests
 from oodd_eval.errors import ResultsError
 from oodd_eval.names import counted, listed
+from oodd_eval.prose import Section, Table
 from oodd_eval.results import tables
 from oodd_eval.results.board import Board
 from oodd_eval.results.record import Record
 from oodd_eval.results.render.data import cells_csv, comparisons_csv, ranking_csv
 from oodd_eval.results.render.text import escape, markdown_body, markdown_list, markdown_table
-from oodd_eval.results.report import Section, findings_of
+from oodd_eval.results.report import findings_of
 from oodd_eval.results.standings import RankedBoard, primary_settings, verdict_of
-from oodd_eval.results.tables import Table, Tables
+from oodd_eval.results.tables import Tables
 from oodd_leaderboard import site
 from oodd_leaderboard.entry import (
     SUITES,

@@ -32,13 +32,14 @@ from oodd_eval.data.bounded import MANIFEST_BYTES, read_bytes
 from oodd_eval.data.facts import ENVIRONMENTS, TABLE1
 from oodd_eval.data.files import find_file, write_text
 from oodd_eval.errors import ResultsError
+from oodd_eval.prose import Table
 from oodd_eval.results.board import Board, boards, expected_cells, grouped
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
 from oodd_eval.results.standings import RankedBoard, primary_settings, ranked
 from oodd_eval.results.strengths import StrengthTables
-from oodd_eval.results.tables import Table, Tables
+from oodd_eval.results.tables import Tables
 
 _T = TypeVar("_T")
 

@@ -18,6 +18,7 @@ from oodd_eval.errors import ResultsError, UsageError
 from oodd_eval.metrics.catalogue import FOUND_WITHIN, UNDEFINED, metric_info
 from oodd_eval.metrics.ranking import PairTest, Ranking
 from oodd_eval.names import counted
+from oodd_eval.prose import Table
 from oodd_eval.results.board import (
     Column,
     Conditions,
@@ -38,7 +39,7 @@ from oodd_eval.results.standings import (
     primary_settings,
     ranked,
 )
-from oodd_eval.results.tables import Table, texts
+from oodd_eval.results.tables import texts
 from oodd_leaderboard.entry import LeaderboardSection, SuiteSection
 
 PUBLISHED: Final = "published.jsonl.xz"

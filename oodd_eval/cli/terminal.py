@@ -15,10 +15,9 @@ from oodd_eval.metrics.bootstrap import nan_mean
 from oodd_eval.metrics.catalogue import metric_info
 from oodd_eval.names import counted
 from oodd_eval.plugins import hookimpl
-from oodd_eval.prose import print_prose
+from oodd_eval.prose import print_prose, print_sections
 from oodd_eval.results.board import boards, level_of, ranked_by
 from oodd_eval.results.record import STATUSES, Record
-from oodd_eval.results.render.text import print_sections
 from oodd_eval.results.report import Report
 from oodd_eval.results.strengths import NO_UNITS
 from oodd_eval.scoring.display import Display

@@ -18,6 +18,7 @@ from oodd_eval.errors import MissingExtraError, ResultsError, UsageError
 from oodd_eval.metrics.alarms import GuaranteedAlarm
 from oodd_eval.metrics.catalogue import LEVELS, metric_info
 from oodd_eval.names import check_known, counted, select
+from oodd_eval.prose import terminal_text
 from oodd_eval.results import plots
 from oodd_eval.results.board import Conditions, boards, level_of
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
@@ -25,7 +26,6 @@ from oodd_eval.results.evaluate import Rules, ScoredEpisode, must_be_of, stored_
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import STATUSES, Record
 from oodd_eval.results.render import FORMATS
-from oodd_eval.results.render.text import terminal_text
 from oodd_eval.results.report import Report, flat
 from oodd_eval.results.standings import PairedComparison, compare_rows, row_named
 from oodd_eval.results.strengths import (
@@ -403,8 +403,19 @@ def _scored(
     sensors = tuple(sensor.name for sensor in data.sensors)
     return [
         ScoredEpisode(
-            *(record.cell, i, scores[i], twin_scores[i], episodes[i], twins[i]),
-            *(starts[i], effects[i], sensors, rule, intervals[i], nominal, LEVELS[level]),
+            record.cell,
+            i,
+            scores[i],
+            twin_scores[i],
+            episodes[i],
+            twins[i],
+            starts[i],
+            effects[i],
+            sensors,
+            rule,
+            intervals[i],
+            nominal,
+            LEVELS[level],
         )
         for i in range(len(scores))
     ]

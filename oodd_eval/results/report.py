@@ -5,55 +5,23 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib import import_module
 from typing import Any, Final, Literal
 
 from oodd_eval.metrics.catalogue import HEADLINE, LEVELS, METRICS, NAMES, UNDEFINED, metric_info
 from oodd_eval.names import counted
+from oodd_eval.prose import Section, Table, terminal_text
 from oodd_eval.results import tables
 from oodd_eval.results.board import Board, boards, grouped
 from oodd_eval.results.compare import MEANINGS, By, Comparison, Difference
 from oodd_eval.results.record import Record
 from oodd_eval.results.standings import verdict_of
 from oodd_eval.results.strengths import StrengthTables, thresholds
-from oodd_eval.results.tables import Table, Tables
+from oodd_eval.results.tables import Tables
 
 Detail = Literal["brief", "wide", "full"]
 
 _OF_PAPER: Final = [name for name, info in METRICS.items() if info.paper]
 _WITHOUT_ALARM: Final = [n for n, info in METRICS.items() if not (info.request or info.paper)]
-
-
-@dataclass(frozen=True, slots=True)
-class Section:
-    """Part of a report.
-
-    Attributes
-    ----------
-    title
-        Plain text, as all texts are: a renderer escapes what its format needs.
-    facts
-        Sentences below the title.
-    findings
-        Sentences that nobody should miss.
-    tables
-        Tables in their order.
-    folded
-        Further tables, which a format that can fold text folds away, under `fold`.
-    notes
-        Sentences below the tables.
-    verdict
-        The one sentence that comes first, such as which row is better.
-    """
-
-    title: str
-    facts: Sequence[str] = ()
-    findings: Sequence[str] = ()
-    tables: Sequence[Table] = ()
-    fold: str = ""
-    folded: Sequence[Table] = ()
-    notes: Sequence[str] = ()
-    verdict: str = ""
 
 
 @dataclass(frozen=True)
@@ -94,9 +62,7 @@ class Report:
 
     def __str__(self) -> str:
         """Return the report as plain text, its verdicts first."""
-        # Renderers are made of reports.
-        text = import_module("oodd_eval.results.render.text").terminal_text(self.sections)
-        return str(text).rstrip("\n")
+        return terminal_text(self.sections).rstrip("\n")
 
     @functools.cached_property
     def sections(self) -> list[Section]:

@@ -19,10 +19,11 @@ from oodd_eval.errors import SplitError, UnknownNameError
 from oodd_eval.metrics.bootstrap import mean_over_cells, nan_mean
 from oodd_eval.metrics.catalogue import FOUND_WITHIN, HEADLINE, UNDEFINED, metric_info
 from oodd_eval.metrics.threshold import DetectionThreshold, MeanThreshold, geometric_mean
+from oodd_eval.prose import Table
 from oodd_eval.results.board import Board, Column
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
-from oodd_eval.results.tables import Table, show_value, unranked
+from oodd_eval.results.tables import show_value, unranked
 
 DETECTION: Final = f"found_within_{FOUND_WITHIN[-1]}_{HEADLINE}"
 """The metric whose share decides: found within 100 rows, where 5 % of nominal episodes alarm."""

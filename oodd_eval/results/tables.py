@@ -15,6 +15,7 @@ from oodd_eval.metrics.bootstrap import nan_mean
 from oodd_eval.metrics.catalogue import PAPER, UNDEFINED, metric_info
 from oodd_eval.names import counted
 from oodd_eval.plugins.contract import training_mark
+from oodd_eval.prose import Table
 from oodd_eval.results.board import Board, Column, Value, cells_with, grouped
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
@@ -22,45 +23,6 @@ from oodd_eval.results.standings import RankedBoard, Standing
 
 BRIEF: Final = "\N{DAGGER}"
 """Marks the figures of brief cells."""
-
-
-@dataclass(frozen=True, slots=True)
-class Table:
-    """A titled table of texts, the first `labels` columns set to the left, with a note below it.
-
-    On a terminal each row has the colour of its position in `colours`, if there are any, and
-    `wrap` lets headings and names take several lines where the table is too wide.
-    """
-
-    title: str
-    header: list[str]
-    rows: list[list[str]]
-    labels: int = 1
-    note: str = ""
-    colours: Sequence[str] = ()
-    wrap: bool = False
-
-    @property
-    def alignment(self) -> tuple[str, ...]:
-        """``"left"`` or ``"right"`` for every column, as tabulate takes it."""
-        return tuple("left" if i < self.labels else "right" for i in range(len(self.header)))
-
-    def columns(self, indices: Sequence[int]) -> "Table":
-        """Return the table with these columns only."""
-        rows = [[row[i] for i in indices] for row in self.rows]
-        return replace(self, header=[self.header[i] for i in indices], rows=rows)
-
-    def transposed(self) -> "Table":
-        """Return the table with rows and columns exchanged.
-
-        Of several labels a first one stands where it changes: a group of columns has its name once.
-        """
-        whole = [list(column) for column in zip(self.header, *self.rows, strict=True)]
-        header = whole[0]
-        if self.labels > 1:
-            pairs = itertools.pairwise(header)
-            header = [header[0], *("" if text == before else text for before, text in pairs)]
-        return replace(self, header=header, rows=whole[1:], labels=1, colours=())
 
 
 def show_value(value: Value, metric: str) -> str:

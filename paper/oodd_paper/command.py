@@ -22,9 +22,9 @@ from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import MissingExtraError, SplitNotFoundError, UsageError
 from oodd_eval.names import check_known, counted, select
 from oodd_eval.plugins.isolation.child import Limits
+from oodd_eval.prose import print_table
 from oodd_eval.results.directory import RECORDS, ResultsDirectory
 from oodd_eval.results.record import Record
-from oodd_eval.results.render.text import print_table
 from oodd_eval.scoring.cores import available_cores
 from oodd_eval.scoring.executors import RunSettings
 from oodd_eval.scoring.plan import Plan

@@ -22,10 +22,10 @@ from typing import Any, Final
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS, TABLE1, paper_tables
 from oodd_eval.metrics.catalogue import metric_info
+from oodd_eval.prose import Table
 from oodd_eval.results.record import Record
 from oodd_eval.results.render.data import csv_rows, number
 from oodd_eval.results.render.text import markdown_table as padded_table
-from oodd_eval.results.tables import Table
 from oodd_paper.claims import NOT_RUN, Ruling, changed, claims_csv, claims_table, rulings, summary
 from oodd_paper.estimates import Estimate, Estimator, Numbers, TableNumber, compute, mean_return
 from oodd_paper.experiments import EXPERIMENTS, TABLE_2, Experiment

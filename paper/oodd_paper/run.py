@@ -17,9 +17,9 @@ from oodd_eval.names import counted
 from oodd_eval.plugins import hookimpl
 from oodd_eval.plugins.discovery import Plugins
 from oodd_eval.plugins.parameters import parameters_of
+from oodd_eval.prose import Table
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
-from oodd_eval.results.tables import Table
 from oodd_eval.scoring.plan import Unit, make_unit
 from oodd_paper.experiments import CONTROLS, Experiment, Tier, settings_of
 

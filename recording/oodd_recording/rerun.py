@@ -48,11 +48,10 @@ from oodd_eval.metrics.catalogue import UNDEFINED, metric_info
 from oodd_eval.names import select
 from oodd_eval.plugins.discovery import Plugins
 from oodd_eval.plugins.isolation.child import Limits
+from oodd_eval.prose import Table, print_table
 from oodd_eval.results.board import grouped, ranked_by
 from oodd_eval.results.directory import RECORDS, ResultsDirectory
 from oodd_eval.results.record import Record
-from oodd_eval.results.render.text import print_table
-from oodd_eval.results.tables import Table
 from oodd_eval.scoring.executors import RunSettings
 from oodd_eval.scoring.plan import Plan, make_plan, source_digest
 from oodd_eval.scoring.runner import run

@@ -19,17 +19,16 @@ from oodd_eval.cli.terminal import TerminalReporter
 from oodd_eval.metrics.bootstrap import bounds, drawn_cell, sample_cells
 from oodd_eval.metrics.catalogue import PAPER
 from oodd_eval.metrics.recalibration import PairedScores
-from oodd_eval.prose import print_prose
+from oodd_eval.prose import Table, print_prose, print_table
 from oodd_eval.results import tables
 from oodd_eval.results.board import Board, boards, contribution
 from oodd_eval.results.compare import write_reference
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.evaluate import Rules, cell_metrics
 from oodd_eval.results.render import FORMATS
-from oodd_eval.results.render.text import print_table
 from oodd_eval.results.report import Report, findings_of
 from oodd_eval.results.standings import compare_rows, verdict_of
-from oodd_eval.results.tables import Table, Tables, why_undefined
+from oodd_eval.results.tables import Tables, why_undefined
 
 
 def rendered(records, name="markdown", **settings):

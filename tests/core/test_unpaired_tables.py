@@ -15,10 +15,10 @@ from oodd_eval.cli.main import main
 from oodd_eval.data.facts import GROUPS
 from oodd_eval.errors import ResultsError
 from oodd_eval.metrics.catalogue import PAPER
+from oodd_eval.prose import print_sections
 from oodd_eval.results.board import Board, boards
 from oodd_eval.results.record import Metric
 from oodd_eval.results.render import FORMATS
-from oodd_eval.results.render.text import print_sections
 from oodd_eval.results.report import Report, findings_of, flat
 from oodd_eval.results.standings import compare_rows, ranked
 from oodd_eval.results.strengths import StrengthTables, thresholds

@@ -25,9 +25,9 @@ from oodd_leaderboard.published import (
 from oodd_eval.cli.main import main
 from oodd_eval.data.files import decompress
 from oodd_eval.errors import ResultsError, UsageError
+from oodd_eval.prose import Table
 from oodd_eval.results.board import Board
 from oodd_eval.results.identity import Setting
-from oodd_eval.results.tables import Table
 
 TEST = 10  # test seeds
 PLACES = [(e, a) for e in ("ant", "hopper") for a in ("iid", "gravity")]

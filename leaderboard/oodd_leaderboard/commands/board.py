@@ -16,17 +16,15 @@ from oodd_eval.cli import DIRECTORY, NAMES, Name, Names, Options, command, say_n
 from oodd_eval.cli.console import make_console
 from oodd_eval.errors import UsageError
 from oodd_eval.names import check_known, counted, select
-from oodd_eval.prose import print_prose
+from oodd_eval.prose import Section, Table, print_prose, print_sections
 from oodd_eval.results import tables
 from oodd_eval.results.board import boards, grouped
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
 from oodd_eval.results.render.data import ranking_csv
-from oodd_eval.results.render.text import markdown_section, print_sections
-from oodd_eval.results.report import Section
+from oodd_eval.results.render.text import markdown_section
 from oodd_eval.results.standings import Standing
-from oodd_eval.results.tables import Table
 from oodd_leaderboard.entry import ENTRY, read_entry
 from oodd_leaderboard.published import (
     MARK,

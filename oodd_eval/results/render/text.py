@@ -1,21 +1,12 @@
 """Reports as text with markup, for people: Markdown, HTML and LaTeX."""
 
-import io
-import re
-import textwrap
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
 from html import escape as escape_html
-from typing import Any, Final
+from typing import Final
 
-from rich.console import Console
-from rich.text import Text
-from tabulate import tabulate
-
-from oodd_eval.prose import print_prose
+from oodd_eval.prose import Section, Table, grid
 from oodd_eval.results.render import renders
-from oodd_eval.results.report import Report, Section
-from oodd_eval.results.tables import Table
+from oodd_eval.results.report import Report
 
 MANY: Final = 6
 """Findings beyond which Markdown folds them away."""
@@ -26,19 +17,6 @@ _LATEX: Final = str.maketrans(
     | {"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", "[": "{[}", "]": "{]}"}
     | {"Δ": r"$\Delta$", "µ": r"$\mu$", "≤": r"$\leq$", "†": r"$\dagger$", "\N{EN DASH}": "--"}
 )
-
-
-def grid(table: Table, layout: str, escape: Callable[[str], str] = str) -> str:
-    """Return header and rows of a table in one of tabulate's layouts."""
-    return str(
-        tabulate(
-            [[escape(cell) for cell in row] for row in table.rows],
-            [escape(name) for name in table.header],
-            layout,
-            colalign=table.alignment if table.rows else None,
-            disable_numparse=True,
-        )
-    )
 
 
 @renders("markdown", "Markdown, everything in it")
@@ -129,95 +107,3 @@ def _parts(report: Report) -> Iterator[tuple[str, str | Table]]:
 
 def _latex(text: str) -> str:
     return " ".join(text.split()).translate(_LATEX)
-
-
-def print_sections(sections: Sequence[Section], console: Console) -> None:
-    """Print the verdict, tables, findings and notes of sections: what is read last stands last."""
-    for section in sections:
-        if section.verdict:
-            print_prose(section.verdict + "\n", console, "bold")
-        for table in section.tables:
-            print_table(table, console)
-        for sentence in section.findings:
-            print_prose(sentence, console, "yellow")
-        for line in section.notes:
-            print_prose(line, console, "dim")
-        if section.notes:
-            console.print("")
-
-
-def terminal_text(sections: Sequence[Section]) -> str:
-    """Return what `print_sections` prints, as wide as the terminal, without colours."""
-    text = io.StringIO()
-    plain: dict[str, Any] = {"highlight": False, "markup": False, "soft_wrap": True}
-    print_sections(sections, Console(file=text, color_system=None, force_jupyter=False, **plain))
-    return text.getvalue()
-
-
-def print_table(table: Table, console: Console, width: int = 0) -> None:
-    """Print one table within a width, by default the console's: as it is, turned, or in parts."""
-    if table.wrap:
-        print_prose(table.title, console, "bold")
-    else:
-        console.print(Text(table.title, "bold"))
-    for part in _fitting(table, width or console.width):
-        lines = grid(part, "simple").splitlines()
-        colours = ["", "", *(part.colours or [""] * (len(lines) - 2))]
-        for line, colour in zip(lines, colours, strict=True):
-            console.print(Text(line, colour))
-        console.print("")
-    if table.note:
-        print_prose(table.note + "\n", console, "dim")
-
-
-def _fitting(table: Table, width: int) -> list[Table]:
-    """Return the table, the table turned, or parts of its columns, whichever first fits."""
-    whole = [table, table.transposed()]
-    if table.wrap:
-        whole += [_wrapped(one, width) for one in whole]
-        table = whole[-2]
-    for one in whole:
-        if _width(one) <= width:
-            return [one]
-    labels = list(range(table.labels))
-    parts = [labels]
-    for column in range(table.labels, len(table.header)):
-        wider = [*parts[-1], column]
-        if parts[-1] == labels or _width(table.columns(wider)) <= width:
-            parts[-1] = wider
-        else:
-            parts.append([*labels, column])
-    return [table.columns(part) for part in parts]
-
-
-def _wrapped(table: Table, width: int) -> Table:
-    """Return a table whose headings and labels take several lines where they are long."""
-    most = max(_NARROW, width // 3)
-
-    def lines(text: str, room: int) -> str:
-        wrapper = textwrap.TextWrapper(room)
-        wrapper.wordsep_re = _PARTS
-        return "\n".join(wrapper.wrap(text))
-
-    columns = [[row[i] for row in table.rows] for i in range(len(table.header))]
-    longest = [max(map(len, column), default=0) for column in columns]
-    header = [
-        lines(text, most if i < table.labels else max(longest[i], _NARROW))
-        for i, text in enumerate(table.header)
-    ]
-    rows = [
-        [lines(text, most) if i < table.labels else text for i, text in enumerate(row)]
-        for row in table.rows
-    ]
-    return replace(table, header=header, rows=rows)
-
-
-_NARROW: Final = 9
-"""Width of a column that headings are wrapped to where its figures are narrower."""
-
-_PARTS: Final = re.compile(r"(\s+|[^-\[,:.=\s]*[-\[,:.=]+)")
-"""Ends of lines are between words, and in names behind what separates their parts."""
-
-
-def _width(table: Table) -> int:
-    return max(map(len, grid(table, "simple").splitlines()), default=0)
