@@ -4,6 +4,7 @@ import ast
 import configparser
 import functools
 import io
+import math
 import re
 import subprocess
 import sys
@@ -165,6 +166,76 @@ def vague_names(path):
 
 def test_names_say_what_they_hold():
     assert not [line for path in (*CORE, *OTHERS) for line in vague_names(path)]
+
+
+def module_name(path):
+    package = next(package for package in PACKAGES if package in path.parents)
+    parts = path.relative_to(package.parent).with_suffix("").parts
+    return ".".join(part for part in parts if part != "__init__")
+
+
+MODULES = {module_name(path) for path in (*CORE, *OTHERS)}
+
+
+def named_by_text(path):
+    """Packages and modules of ours in texts of a module, which contracts of imports do not see."""
+    for node in ast.walk(tree(path)):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            yield node.value.partition(":")[0]
+
+
+LAZY = {
+    "oodd_eval/__init__.py": "names that stay there, of packages",
+    "oodd_eval/cli/__init__.py": "what shells complete, below it",
+    "oodd_eval/cli/info.py": "the description of a split, as data info prints it",
+    "oodd_eval/cli/main.py": "the table of commands",
+    "oodd_eval/cli/run.py": "the launcher of --sandbox, and how it finds plug-ins",
+    "oodd_eval/plugins/isolation/supervisor.py": "the process that it starts",
+    "oodd_eval/scoring/plan.py": "packages that digests of plug-ins pass over",
+}
+"""Modules that may name others by text, and why."""
+
+
+def test_no_text_imports_what_the_contracts_forbid():
+    paths = [path for path in CORE if str(path.relative_to(ROOT)) not in LAZY]
+    known = MODULES - {"oodd_eval"}
+    assert not wrong(paths, lambda path: {*named_by_text(path)} & known - {module_name(path)})
+
+
+AROUND = ("oodd_checks", "oodd_leaderboard", "oodd_live", "oodd_logs")
+LOADS = {
+    "list detectors": ((*AROUND, "oodd_eval.results", "oodd_eval.scoring"), 1_950),
+    "run --detector mewma --env hopper -q": (AROUND, 10_500),
+    "data inspect logs": (("oodd_eval.results", "oodd_eval.scoring", "oodd_live"), 6_000),
+    "scan logs": (("oodd_eval.results", "oodd_eval.scoring"), 10_500),
+}
+"""What a command may not load, and how many code lines of the project it loads at most."""
+
+
+@pytest.mark.parametrize("command", LOADS)
+def test_commands_load_what_they_need(command, tmp_path):
+    (tmp_path / "logs").mkdir()
+    for number in range(12):
+        rows = "".join(f"{t},{math.sin(t + number)},{math.cos(t)}\n" for t in range(60))
+        (tmp_path / "logs" / f"{number:02}.csv").write_text(f"t,speed,torque\n{rows}")
+    code = (
+        "import sys\n"
+        "from oodd_eval.cli.main import main\n"
+        f"assert main({command.split()!r}) in (0, 1)\n"
+        "ours = [m for m in list(sys.modules.values()) if m.__name__.startswith('oodd_')]\n"
+        "print(*['', *(f'{m.__name__}={m.__file__}' for m in ours)], sep='\\n')\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    rooms = "|".join(("oodd_eval", *AROUND))  # what detectors load is theirs
+    loaded = dict(re.findall(rf"^((?:{rooms})\b[\w.]*)=(.*)$", done.stdout, re.MULTILINE))
+    forbidden, most = LOADS[command]
+    assert not [name for name in loaded if name.startswith(forbidden)]
+    lines = {name: code_lines(Path(path).read_text()) for name, path in loaded.items()}
+    print(f"{command}: {len(lines)} modules, {sum(lines.values())} code lines")  # noqa: T201  by -s
+    assert sum(lines.values()) <= most
 
 
 @pytest.mark.parametrize(
