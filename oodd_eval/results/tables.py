@@ -195,8 +195,8 @@ class Tables:
         """Return every metric without an alarm, mean over all cells, with nulls and the placebo."""
         usual = [n for n, info in catalogue.METRICS.items() if info.cells != "unpaired"]
         infos = map(metric_info, self.board.present(catalogue.METRICS) or usual)
-        shown = [info for info in infos if not info.request and not info.paper]
-        columns = [Column(info.name, info.title, intervals=self.intervals) for info in shown]
+        printed = [info for info in infos if not info.request and not info.paper]
+        columns = [Column(info.name, info.title, intervals=self.intervals) for info in printed]
         return self.table("All metrics of separability (%), mean over cells", columns)
 
     def all_alarms(self) -> list[Table]:

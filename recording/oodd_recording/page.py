@@ -99,8 +99,8 @@ class Page:
             Names of the files that `pictures` yielded; the page shows these.
         """
         lead, heading, sections = f"\n{self.description()}".partition("\n## ")
-        shown = {"png": "a frame half-way through an episode", "svg": "a drawing"}
-        files = ((f"{self.environment}.{suffix}", alt) for suffix, alt in shown.items())
+        alts = {"png": "a frame half-way through an episode", "svg": "a drawing"}
+        files = ((f"{self.environment}.{suffix}", alt) for suffix, alt in alts.items())
         parts = [
             f"# {self.info.title}",
             *(f"![{self.info.title}: {alt}]({name})" for name, alt in files if name in pictures),
