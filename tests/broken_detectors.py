@@ -250,9 +250,7 @@ for check, name, message, change in (
 
 for name, message, change in (
     ("Nothing", "explain returned NoneType, expected shares and onsets", lambda *_: None),
-    ("SharesOfOne", "shares as float64 of shape (81,)", lambda _, e, x: (e[0][:, 0], e[1])),
     ("OnsetsInBetween", "onsets as float64 of shape (81,)", lambda _, e, x: (e[0], e[1] - 0.5)),
-    ("DoubtsItself", "explain raised ZeroDivisionError", lambda *_: 1 / 0),
     ("SharesInPercent", "explain gives the shares", lambda _, e, x: (100 * e[0], e[1])),
     (
         "OnsetsAhead",
@@ -377,18 +375,6 @@ class SharesOfTheWhole(Good):
         return np.where(np.isnan(shares), np.nan, mean), onsets
 
 
-@breaks("streaming", "update differs from score of the whole episode: at t = 1")
-class CountsEpisodes(Good):
-    episodes = -1
-
-    def reset(self):
-        super().reset()
-        self.episodes += 1
-
-    def update(self, observation, action=None):
-        return super().update(observation, action) + self.episodes
-
-
 @breaks("streaming", "has only one of reset and update: expected both, or none")
 class HalfStreaming(Good):
     reset = None
@@ -453,12 +439,6 @@ class HandsOverObjects(Good):
         return {"std": self.std_.astype(object)}
 
 
-@breaks("state", "state raised ContractError: state() of detector: TypeError", also={"shared-fit"})
-class HandsOverItself(Good):
-    def state(self):
-        return {"detector": self}
-
-
 @breaks("state", "array 'scored' of state() differs after scoring")
 class HandsOverScores(Good):
     scored = 0
@@ -507,16 +487,6 @@ class LeavesAThread(Good):
         super().fit(nominal)
         ENDS.append(threading.Event())
         threading.Thread(target=ENDS[-1].wait, name="pump").start()
-
-
-@breaks("leftovers", "left running: daemon thread pump: end what was started")
-class LeavesADaemonThread(Good):
-    state = restore = None
-
-    def fit(self, nominal):
-        super().fit(nominal)
-        ENDS.append(threading.Event())
-        threading.Thread(target=ENDS[-1].wait, name="pump", daemon=True).start()
 
 
 @breaks("leftovers", "left running: process")

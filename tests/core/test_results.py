@@ -138,14 +138,15 @@ def test_installed_detectors_are_selected_as_on_the_command_line(tiny_split):
 def test_progress_says_what_is_being_fitted(tiny_split, capsys, monkeypatch):
     class Slow(Size):
         def fit(self, nominal):
-            time.sleep(0.6)
+            time.sleep(0.5)
             return super().fit(nominal)
 
-    monkeypatch.setattr(display, "SILENCE", 0.2)
-    evaluate(Slow, tiny_split, **CELLS, progress=True)
-    assert re.search(r"^slow on hopper: fitting, \d s$", capsys.readouterr().err, re.MULTILINE)
-    evaluate(Slow, tiny_split, **CELLS)
-    assert "slow" not in capsys.readouterr().err
+    monkeypatch.setattr(display, "SILENCE", 0.1)
+    cells = {"environments": "hopper", "anomalies": "iid"}
+    for progress in (True, False):
+        evaluate(Slow, tiny_split, **cells, progress=progress)
+        told = re.search(r"^slow on hopper: fitting, \d s$", capsys.readouterr().err, re.MULTILINE)
+        assert bool(told) == progress
 
 
 def test_an_object_that_cannot_be_copied_says_why_and_its_class_will_do(tiny_split):

@@ -56,10 +56,6 @@ def cell(nominal, anomalous, intervals, *, tasks=None, nominal_tasks=None, clock
     )
 
 
-def wins(score, others):
-    return np.mean([(score > x) + 0.5 * (score == x) for x in others])
-
-
 def in_interval(intervals, t):
     return not intervals or any(max(a, 0) <= t < b for a, b in intervals)
 
