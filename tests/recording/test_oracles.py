@@ -327,6 +327,7 @@ def test_a_fit_of_another_shape_is_refused(detectors):
 # The ceiling
 
 
+@pytest.mark.slow  # a script of benchmarks
 def test_the_ceilings_script_has_the_parameters_of_each_seed(capsys):
     path = ROOT / "benchmarks" / "worlds_oracles.py"
     spec = importlib.util.spec_from_file_location("worlds_oracles", path)
