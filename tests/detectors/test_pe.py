@@ -106,8 +106,10 @@ def test_the_ensemble_judges_as_its_networks_do(sensors):
     random = np.random.default_rng(0)
     x, y = random.normal(size=(ROWS, 4)), random.normal(size=(ROWS, sensors))
     ensemble = DensityEnsemble(network.arrays())
-    found = said(network, *map(torch.from_numpy, (x, y)))
-    each = np.stack([y, y])
+    # Members judge outcomes of their own linear forecasts.
+    each = np.stack([y, 2 * y])
+    with torch.no_grad():
+        found = network(torch.from_numpy(x).expand(2, -1, -1), torch.from_numpy(each))
     expected = found.residual, found.log_tail
     for part, member, values in zip(
         ensemble(x, each), ensemble.each(x, each), expected, strict=True
@@ -116,14 +118,8 @@ def test_the_ensemble_judges_as_its_networks_do(sensors):
         np.testing.assert_allclose(member, values, atol=1e-12)
     row = ensemble(x[-1:], each[:, -1:])
     np.testing.assert_allclose(row[0], ensemble(x, each)[0][-1:], atol=1e-12)
-
-
-def test_members_judge_outcomes_of_their_linear_forecasts(drawn):
-    network, x, y = drawn
-    ensemble, each = DensityEnsemble(network.arrays()), torch.stack([y, 2 * y])
-    with torch.no_grad():
-        expected = network(x.expand(2, -1, -1), each)
-    np.testing.assert_allclose(ensemble.each(x.numpy(), each.numpy())[0], expected.residual)
+    assert rounds(240) == [30, 60, 120, 240]
+    assert rounds(7) == [7]
 
 
 @pytest.mark.parametrize(("nu", "std"), [(4.0, 1.19), (16.0, 1.05), (64.0, 1.01)])
@@ -180,11 +176,6 @@ def test_training_finds_means_scales_dependence_and_tails():
     assert matrix[1, 0] / matrix[1, 1] == pytest.approx(-0.8, abs=0.1)
     tails = found.log_tail.exp().mean((0, 1))
     assert tails[0] < 8 < tails[1]
-
-
-def test_rounds_double_up_to_the_number_of_updates():
-    assert rounds(240) == [30, 60, 120, 240]
-    assert rounds(7) == [7]
 
 
 def test_the_likelihood_of_held_out_rows_is_that_of_each_members_own():
@@ -304,9 +295,7 @@ def test_sums_are_exponentially_weighted_means_by_hand(charts):
         size = math.sqrt(0.1 / 1.9 * (1 - 0.81 ** (n + 1)))
     expected = np.linalg.norm(z / size @ charts.roots_[1])
     assert sums(charts, steps)[1, -1] == pytest.approx(expected)
-
-
-def test_sums_in_parts_are_those_of_the_whole(charts):
+    # In parts they are those of the whole.
     steps = evidence(60, residuals=np.r_[np.full((30, 2), 20.0), np.zeros((30, 2))])
     running, whole = Running(charts), sums(charts, steps)
     parts = [sums(charts, Evidence(*(v[n : n + 7] for v in steps)), running)

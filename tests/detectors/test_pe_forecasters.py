@@ -7,7 +7,6 @@ import pytest
 import torch
 from oodd_pe import PeParameters, make_pe
 from oodd_pe.choice import ChosenForecaster
-from oodd_pe.ensemble import BLOCK, DensityEnsemble
 from oodd_pe.forecaster import Transitions, Units
 from oodd_pe.gaussian import (
     GaussianForecaster,
@@ -22,7 +21,6 @@ from oodd_pe.gaussian import (
 )
 from oodd_pe.kalman import FilterModel, KalmanForecaster, linear, noise_shows
 from oodd_pe.likelihood import student
-from oodd_pe.network import DensityNetworks
 from scipy import stats
 
 from oodd_eval import Trajectory
@@ -325,19 +323,6 @@ def test_student_reaches_the_density_that_residuals_were_drawn_from(nu):
         stats.t(nu, scale=s).logpdf(r).mean() for s, r in zip((3.0, 0.1), residuals.T, strict=True)
     ]
     np.testing.assert_allclose(student(residuals).mean(axis=0), expected, atol=0.005)
-
-
-def test_the_ensembles_log_densities_are_those_of_its_networks():
-    network = DensityNetworks(2, 4, 3, 8, seed=3).double()
-    random = torch.Generator().manual_seed(0)
-    with torch.no_grad():
-        network.out.mul_(10)
-    x, y = (torch.randn(BLOCK + 3, n, generator=random, dtype=torch.float64) for n in (4, 3))
-    with torch.no_grad():
-        expected = -network(*(v.expand(2, -1, -1) for v in (x, y))).surprise().numpy()
-    every = np.broadcast_to(y.numpy(), (2, *y.shape))
-    densities = DensityEnsemble(network.arrays()).log_densities(x.numpy(), every)
-    np.testing.assert_allclose(densities, expected)
 
 
 # The choice
