@@ -355,11 +355,9 @@ def calibration_draws(environment: str, draws: int, resamples: int) -> NDArray[n
 
 
 def _trials(cells: Sequence[DrawnCells], sizes: Mapping[tuple[str, str], int]) -> int:
-    """Return the number of independent trajectories behind some cells.
-
-    Where all conditions of an environment are compared with the same nominal episodes, there are no
-    more than of these.
-    """
+    """Return the number of independent trajectories behind some cells."""
+    # Where all conditions of an environment are compared with the same nominal episodes, there are
+    # no more than of these.
     totals: dict[str, int] = {}
     for (environment, _), n in sizes.items():
         totals[environment] = totals.get(environment, 0) + n

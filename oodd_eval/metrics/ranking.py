@@ -183,12 +183,11 @@ def rank(
 
 
 class _Influences(NamedTuple):
-    """Shifts of a row's mean by each test seed and each detector seed, centred on 0.
+    """Shifts of a row's mean by each test seed and each detector seed, centred on 0."""
 
-    `of_tests` is by sample, see `_samples`; `of_detectors` is empty where there is one detector
-    seed, and `key` names the draws of these. `of_calibrations` is by environment, empty for
-    metrics that calibration does not change.
-    """
+    # `of_tests` is by sample, see `_samples`; `of_detectors` is empty where there is one detector
+    # seed, and `key` names the draws of these. `of_calibrations` is by environment, empty for
+    # metrics that calibration does not change.
 
     of_tests: Mapping[str, Floats]
     of_detectors: Floats
@@ -206,10 +205,9 @@ class _Tested(NamedTuple):
 
 
 class _PairBootstrap:
-    """The bootstrap of pairs of rows with R resamples.
+    """The bootstrap of pairs of rows with R resamples."""
 
-    Where it is `extended`, p-values that are too small to be counted follow Student's tail.
-    """
+    # Where it is `extended`, p-values that are too small to be counted follow Student's tail.
 
     def __init__(
         self, rows: Mapping[str, _Influences], resamples: int, *, extended: bool = False
@@ -314,17 +312,16 @@ class _PairBootstrap:
             variances += of_calibrations
             shifts = self._shifts[row, block] - self._shifts[columns, block]
             with np.errstate(divide="ignore", invalid="ignore"):
-                # Where all seeds agree to the last digit, no shift over no spread is no shift.
+                # 0/0 counts as 0: all seeds agree to the last digit.
                 ratios = np.where(np.abs(shifts) > NOISE, shifts / np.sqrt(variances), 0.0)
             studentized[:, block] = ratios
         return studentized
 
     def _extended(self, studentized: Floats, observed: float) -> float:
-        """Return a p-value too small to be counted.
-
-        Between the p-values at the `ENOUGH`-th and the ten times `ENOUGH`-th largest resample, its
-        logarithm is taken to be linear in that of Student's tail, but never steeper than this.
-        """
+        """Return a p-value too small to be counted."""
+        # Between the p-values at the `ENOUGH`-th and the ten times `ENOUGH`-th largest resample,
+        # its logarithm is taken to be linear in that of Student's tail, but never steeper than
+        # this.
         last = len(studentized) - 1
         places = [last - ENOUGH, last - 10 * ENOUGH]
         near, far = (self._tail(t) for t in np.sort(studentized)[places])
@@ -389,10 +386,8 @@ def tie_groups(names: Sequence[str], better: Iterable[tuple[str, str]]) -> list[
 def _cliques(
     alike: Mapping[str, set[str]], group: list[str], more: set[str], done: set[str]
 ) -> Iterator[list[str]]:
-    """Yield the largest groups of rows that are all alike (Bron & Kerbosch, 1973, with pivots).
-
-    They are those with `group`, some of `more`, and none of `done`, in which groups were yielded.
-    """
+    """Yield the largest groups of rows that are all alike (Bron & Kerbosch, 1973, with pivots)."""
+    # They are those with `group`, some of `more`, and none of `done`, in which groups were yielded.
     if not more and not done:
         yield group
         return
@@ -496,21 +491,17 @@ def _mean(row: Row) -> float:
 
 
 def _samples(cell: Position, contribution: Contribution) -> dict[str, slice]:
-    """Return the terms of each sample of test trajectories by its name, for one cell.
-
-    Cells of one environment have one sample. Without twins nominal episodes are that sample, and
-    each condition has a sample of its own.
-    """
+    """Return the terms of each sample of test trajectories by its name, for one cell."""
+    # Cells of one environment have one sample. Without twins nominal episodes are that sample, and
+    # each condition has a sample of its own.
     if contribution.nominal is None:
         return {cell[0]: slice(None)}
     return {cell[0]: slice(contribution.nominal), "/".join(cell): slice(contribution.nominal, None)}
 
 
 def _influences(name: str, row: Row, used: Collection[str]) -> _Influences:
-    """Return what every drawn seed adds to the row's mean, centred, by the samples that are used.
-
-    A trajectory of weight w adds w times its influence: exact for means such as a matched AUC.
-    """
+    """Return what each drawn seed adds to the row's mean, centred, by the samples that are used."""
+    # A trajectory of weight w adds w times its influence: exact for means such as a matched AUC.
     seeds, cells = sorted(row), sorted(row[min(row)])
     parts: dict[str, list[Floats]] = {}
     for cell in cells:

@@ -192,10 +192,8 @@ def geometric_mean(
 
 
 def _drawn(environment: str, terms: Floats) -> Floats:
-    """Return sums of terms (seeds, K, n) over all, then over what each resample draws: (K, 1 + R).
-
-    The terms are 0 and 1, so that their sums are exact in any order.
-    """
+    """Return sums of terms (seeds, K, n) over all, then over each resample: (K, 1 + R)."""
+    # The terms are 0 and 1, so that their sums are exact in any order.
     seeds, rungs, n = terms.shape
     weights = shared_weights(environment, n)
     by_seed = (terms.reshape(-1, n) @ weights.T).reshape(seeds, rungs, -1)
@@ -205,10 +203,8 @@ def _drawn(environment: str, terms: Floats) -> Floats:
 
 
 def _ends(logs: Floats) -> tuple[float, float]:
-    """Return the percentiles of resamples, which may be infinite, next beyond the level.
-
-    The interval contains the value itself, which comes first.
-    """
+    """Return the percentiles of resamples, which may be infinite, next beyond the level."""
+    # The interval contains the value itself, which comes first.
     ordered = np.sort(logs[1:])
     last = len(ordered) - 1
     low = ordered[math.floor((1 - LEVEL) / 2 * last)]

@@ -145,10 +145,9 @@ def separability(cell: UnpairedScores, statistic: GuaranteedAlarm) -> Metrics:
 
 
 class _Comparison(NamedTuple):
-    """Judged rows with the index of their episodes, and the rows that they are compared with.
+    """Judged rows with the index of their episodes, and the rows that they are compared with."""
 
-    Both are in the order of their episodes.
-    """
+    # Both are in the order of their episodes.
 
     judged: Floats
     episodes: Indices
@@ -157,10 +156,9 @@ class _Comparison(NamedTuple):
 
 
 class _Placements(NamedTuple):
-    """Mean shares of reference rows below each judged episode, and the influence of references.
+    """Mean shares of reference rows below each judged episode, and the influence of references."""
 
-    Shares are NaN for episodes without a row; `used` references are compared with any.
-    """
+    # Shares are NaN for episodes without a row; `used` references are compared with any.
 
     shares: Floats
     influences: Floats
@@ -175,10 +173,8 @@ def _placements(
     clock: bool,
     same: bool = False,
 ) -> _Placements:
-    """Compare chosen rows of judged episodes with those of reference episodes.
-
-    If they are the `same`, judged episode k is reference k, with which it is not compared.
-    """
+    """Compare chosen rows of judged episodes with those of reference episodes."""
+    # If they are the `same`, judged episode k is reference k, with which it is not compared.
     chosen = [mask & ~np.isnan(s) for mask, s in zip(chosen, judged, strict=True)]
     if clock:
         present = np.zeros(max(map(len, (*judged, *references)), default=0), np.intp)
@@ -203,10 +199,8 @@ def _placements(
 def _shares_and_changes(
     compared: _Comparison, rows: Indices, *, same: bool
 ) -> tuple[Floats, Floats]:
-    """Return the share of references below each judged row, and what each reference changes.
-
-    `rows` are those of each judged episode, all of which count alike.
-    """
+    """Return the share of references below each judged row, and what each reference changes."""
+    # `rows` are those of each judged episode, all of which count alike.
     judged, episodes, references, others = compared
     below, rivals = _below(judged, references), np.full(len(judged), float(len(references)))
     if same:
@@ -244,10 +238,8 @@ def _below(values: NDArray[Any], references: NDArray[Any], weights: Floats | Non
 
 
 def _changes(judged: Floats, shares: Floats, weights: Floats, references: Floats) -> Floats:
-    """Return what each reference adds to the weighted shares beyond what the mean one does.
-
-    Sums are taken in the order of `_below`, so that ties everywhere give 0 without rounding.
-    """
+    """Return what each reference adds to the weighted shares beyond what the mean one does."""
+    # Sums are taken in the order of `_below`, so that ties everywhere give 0 without rounding.
     order = np.argsort(judged, kind="stable")
     total, mean = np.cumsum(weights[order])[-1], np.cumsum((weights * shares)[order])[-1]
     changes: Floats = total - _below(references, judged, weights) - mean
@@ -544,10 +536,8 @@ def _found_outcome(
 
 
 def _task_weights(cell: UnpairedScores, chosen: Iterable[int]) -> Floats:
-    """Return weights of nominal episodes that give tasks the shares that chosen ones give them.
-
-    They are 1 where there is one task.
-    """
+    """Return weights of nominal episodes that give tasks the shares that chosen ones give them."""
+    # They are 1 where there is one task.
     weights, counts = np.zeros(len(cell.nominal)), {*chosen}
     for nominal, anomalous in cell.by_task():
         weights[nominal] = len(counts & {*anomalous}) / len(nominal)

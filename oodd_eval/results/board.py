@@ -333,10 +333,8 @@ def _is_median(metric: str) -> bool:
 
 
 def _drawn_cells(records: Sequence[Record], metric: str) -> dict[tuple[int, ...], DrawnCells]:
-    """Return the cells of a row that have terms of a metric, by the indices of their records.
-
-    Thresholds are no ratios of sums, and have no terms.
-    """
+    """Return the cells of a row that have terms of a metric, by the indices of their records."""
+    # Thresholds are no ratios of sums, and have no terms.
     by_shape: dict[tuple[str, str, int | None, int], list[int]] = {}
     for i, r in enumerate(records):
         if metric in r.per_trajectory:

@@ -313,10 +313,8 @@ def _calibration_draws(
     scores: ScoreFile,
     data: EnvironmentData,
 ) -> list[Draws]:
-    """Return what calibration does to the alarms of each cell of a unit.
-
-    A rolling calibration is not resampled: its episodes have an order.
-    """
+    """Return what calibration does to the alarms of each cell of a unit."""
+    # A rolling calibration is not resampled: its episodes have an order.
     if first.rolling:
         return [{} for _ in cells]
     again = Recalibration.fit(scores.parts[CALIBRATION], first.alarm, first.environment)

@@ -71,10 +71,8 @@ def trajectory(episode: ScoredEpisode) -> Figure:
 
 
 def _sensors(axis: Any, episode: ScoredEpisode) -> None:
-    """Draw the sensors that leave the course of their twin most, dashed that course.
-
-    Without a twin, those that are farthest from nominal episodes in the anomalous rows.
-    """
+    """Draw the sensors that leave the course of their twin most, dashed that course."""
+    # Without a twin, those that are farthest from nominal episodes in the anomalous rows.
     rows = episode.trajectory.observations.astype(np.float64)
     if episode.twin is not None:
         course = episode.twin.observations

@@ -117,10 +117,8 @@ class Strengths:
 
 
 def _calibrated(environment: str, anomaly: str) -> Mapping[str, Rung]:
-    """Return the rungs of the benchmark's ladder; none for what is not calibrated.
-
-    Those of other environments are known from records alone, whatever is installed.
-    """
+    """Return the rungs of the benchmark's ladder; none for what is not calibrated."""
+    # Those of other environments are known from records alone, whatever is installed.
     if environment not in ENVIRONMENTS:
         return {}
     try:
@@ -130,11 +128,9 @@ def _calibrated(environment: str, anomaly: str) -> Mapping[str, Rung]:
 
 
 def _rung_of(record: Record) -> Rung | None:
-    """Return the strength of a record, None where its number is not known.
-
-    What a rung of the ladder costs is known from the ladder, as is the number of those that older
-    records lack.
-    """
+    """Return the strength of a record, None where its number is not known."""
+    # What a rung of the ladder costs is known from the ladder, as is the number of those that older
+    # records lack.
     rung = _calibrated(*_pair(record)).get(record.strength)
     if record.magnitude is None or (rung and rung.strength == record.magnitude):
         return rung

@@ -205,10 +205,8 @@ class Child:
                     self._printed = (self._printed + part)[-LOG_BYTES:]
 
     def _watch(self) -> None:
-        """Hang up when a limit is passed, or when the process has ended.
-
-        A process that it has started may hold a channel open, or send half a frame.
-        """
+        """Hang up when a limit is passed, or when the process has ended."""
+        # A process that it has started may hold a channel open, or send half a frame.
         while not self._ended.wait(POLL_SECONDS):
             if not self.exited:
                 self._verdict = self._verdict or self._judge()
@@ -248,10 +246,8 @@ class Child:
         return None
 
     def _used(self) -> tuple[int, int]:
-        """Return the resident bytes and the number of its processes: now and then of all of them.
-
-        What processes share counts once. In between, the largest counts.
-        """
+        """Return resident bytes and the number of its processes, now and then of all."""
+        # What processes share counts once. In between, the largest counts.
         looks, held = time.monotonic() - self._looked > LOOK_SECONDS, 0
         if looks:
             self._looked = time.monotonic()

@@ -128,7 +128,8 @@ class _UnitRun:
                     fitted = None
             for group in groups:
                 self._group(fitted, group, "stream" if self.streamed else "score")
-            # Last, as only what comes again is anomalous: no process that scores is told so.
+            # Explain last: only anomalous episodes are explained, and a scoring process must not
+            # learn which.
             for group in explained if self.explains and not self.streamed else ():
                 self._group(fitted, group, "explain")
         self.outcome.seconds_score = min(self.seconds, time.monotonic() - self.start)

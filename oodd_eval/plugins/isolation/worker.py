@@ -241,10 +241,8 @@ def _score(channel: Channel, detector: Detector, *, score: int = 0, explain: int
 
 
 def _score_rows(channel: Channel, detector: Detector, *, stream: int) -> None:
-    """Score an episode row by row: each comes when the score of the one before was sent.
-
-    A row is an observation, behind the action of that width that came before it, if there is one.
-    """
+    """Score an episode row by row: each comes when the score of the one before was sent."""
+    # A row is an observation, behind the action of that width that came before it, if there is one.
     streaming = detector if isinstance(detector, StreamingDetector) else _Prefixes(detector, stream)
     seconds, width = 0.0, 0
     streaming.reset()
@@ -287,10 +285,8 @@ class _Prefixes:
 
 
 def _runs_on(threads: int) -> bool:
-    """Tell whether more threads run than there were, or a child, also after a while.
-
-    The system ends a thread a moment after it was joined.
-    """
+    """Tell whether more threads run than there were, or a child, also after a while."""
+    # The system ends a thread a moment after it was joined.
     here, end = psutil.Process(), time.monotonic() + FIT_END_SECONDS
     while here.num_threads() > threads or _children():
         if time.monotonic() > end:
@@ -337,12 +333,10 @@ def connect(arguments: Sequence[str]) -> Channel:
 
 
 def _guard(lifeline: int) -> None:
-    """Go on in a fork, which this process waits for and ends like; none of the two outlives either.
-
-    What the fork has started, and left behind, becomes this process's (Linux). It is ended with the
-    fork, and all is when the harness ends. No thread could do so beside a detector, which may hold
-    the interpreter's lock.
-    """
+    """Continue in a forked child; the parent waits and exits with the child's status."""
+    # If either dies, so does the other. Processes that the child started and left behind become the
+    # parent's (Linux), which ends them with the child. A thread beside a detector could not: the
+    # detector may hold the interpreter's lock.
     guard = os.getpid()
     process_control(CHILD_SUBREAPER, 1)
     if (worker := os.fork()) == 0:
