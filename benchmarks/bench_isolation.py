@@ -1,11 +1,11 @@
-"""Cost of groups apart: a plain run beside one with larger groups, and a re-run by rows.
+"""Cost of groups apart: a plain run beside one with larger groups, and a sandboxed one by rows.
 
 ``python benchmarks/bench_isolation.py [--jobs N] [DETECTOR ...]`` (default rf, npn and riqn) first
 fits and scores hopper of split mini, in turns, as a run does and with each part as one group: more
 forks and smaller batches come on top of the work itself. Then it scores all of mini row by
-row with a quick ``pe-a``, each group in a fresh sandbox, as a re-run does; the fits are excluded.
-Exit code 1 when the plain runs cost more than 10 % of all together, or the re-run takes more than
-five minutes on as many cores.
+row with a quick ``pe-a``, each group in a fresh sandbox; the fits are excluded. Exit code 1 when
+the plain runs cost more than 10 % of all together, or the sandboxed one takes more than five
+minutes on as many cores.
 """
 
 import argparse

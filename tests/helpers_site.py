@@ -10,17 +10,7 @@ from helpers_records import PAIRED, make_record
 from oodd_leaderboard import site
 from oodd_leaderboard.curve_file import write_curves
 from oodd_leaderboard.curves import Sweep, cell_curves, thresholds
-from oodd_leaderboard.entry import (
-    EntryInfo,
-    Grant,
-    SubmittedEntry,
-    digest_of,
-    read_entries,
-    read_grants,
-    sections,
-    suite_sections,
-    write_grants,
-)
+from oodd_leaderboard.entry import EntryInfo, SubmittedEntry, read_entries, sections, suite_sections
 from oodd_leaderboard.site.data import site_data
 
 from oodd_eval.data.condition import rungs_of
@@ -38,7 +28,7 @@ SIMILAR = {"delay_censored_null": "delay_null", "missed_null": "missed"}
 """Metrics without a level whose numbers stand in for guaranteed alarms; otherwise ``far_twin``."""
 
 
-def submitted(name, records, trust="reported", **meta):
+def submitted(name, records, **meta):
     """An entry in memory."""
     first = records[0]
     texts = {"title": "An entry", "citation": "", "url": "", "caption": "",
@@ -51,12 +41,11 @@ def submitted(name, records, trust="reported", **meta):
         split_digest=first.split_digest, protocol=first.protocol,
         **texts | {"plugins": [plugin], "environment": made_with} | meta,
     )  # fmt: skip
-    grant = None if trust == "reported" else Grant("", trust, "us", "2026-11-22", "fresh seeds")
-    return SubmittedEntry(Path(name), info, records, grant)
+    return SubmittedEntry(Path(name), info, records)
 
 
-def write_entry(root, identity, records, *, curves=(), trust="reported", **fields):
-    """Write one entry and grant it its trust; `curves` names detectors whose cells get some."""
+def write_entry(root, identity, records, *, curves=(), **fields):
+    """Write one entry; `curves` names detectors whose cells get some."""
     directory = root / identity
     directory.mkdir(parents=True)
     lines = [record.to_json() + "\n" for record in records]
@@ -68,9 +57,6 @@ def write_entry(root, identity, records, *, curves=(), trust="reported", **field
              "url": "https://example.org/page", "plugins": [], "environment": {}}  # fmt: skip
     text = submitted(identity, records, **texts | fields).meta.to_json()
     (directory / "entry.json").write_text(text, encoding="utf-8")
-    if trust != "reported":
-        grant = Grant(digest_of(text.encode()), trust, "C. Hecker", "2026-11-22", "fresh seeds")
-        write_grants(root, read_grants(root) | {identity: grant})
 
 
 GRADED_ROWS = {"riqn": (0, 0.5), "rf": (0.5, 1), "clock": (0, 0)}

@@ -20,7 +20,7 @@ from oodd_eval.metrics.catalogue import metric_info
 
 @dataclass(frozen=True)
 class Submissions:
-    """A split, results on it, and two valid entries: `plain`, and `full` with scores and curves."""
+    """A split, results on it, and two valid entries: `plain`, and `full` with curves."""
 
     split: object
     results: object
@@ -37,9 +37,7 @@ def make_submissions(home):
         evaluate(detector, split, output=results)
     statement = Statement(submitter="A. Tester", citation="Tester, Trivial rows, 2026")
     plain = submit(results, home / "plain", statement)
-    full = submit(
-        results, home / "full", statement, detectors="persistence", scores=True, split=split
-    )
+    full = submit(results, home / "full", statement, detectors="persistence", split=split)
     return Submissions(split, results, plain.path, full.path)
 
 

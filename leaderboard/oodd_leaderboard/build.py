@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Final
 
 from oodd_eval._version import repository
-from oodd_eval.data.facts import SPLITS, title_of
+from oodd_eval.data.facts import SPLITS
 from oodd_eval.data.files import PACKED, compress, decompress, write_bytes, write_text
 from oodd_eval.data.split import published_digests
 from oodd_eval.errors import ResultsError
-from oodd_eval.names import counted, listed
+from oodd_eval.names import counted
 from oodd_eval.prose import Section, Table
 from oodd_eval.results import tables
 from oodd_eval.results.board import Board
@@ -26,6 +26,7 @@ from oodd_eval.results.standings import RankedBoard, primary_settings, verdict_o
 from oodd_eval.results.tables import Tables
 from oodd_leaderboard import site
 from oodd_leaderboard.entry import (
+    REPORTED,
     SUITES,
     TABLES,
     LeaderboardSection,
@@ -45,11 +46,11 @@ TEXTS: Final = tomllib.loads(Path(__file__).with_name("page.toml").read_text(enc
 WIDEST: Final = 12  # rows beyond which the matrix of win rates is left to ``comparisons.csv``
 
 
-def _origin(board: str, entry: str, trust: str, *, primary: bool, trivial: bool) -> dict[str, str]:
+def _origin(board: str, entry: str, *, primary: bool, trivial: bool) -> dict[str, str]:
     """Return the columns that stand before a cell's own in the table of all cells."""
     flags = {"primary": primary, "trivial": trivial}
     texts = {name: str(flag).lower() for name, flag in flags.items()}
-    return {"board": board, "entry": entry, "trust": trust, **texts}
+    return {"board": board, "entry": entry, **texts}
 
 
 def build(
@@ -89,7 +90,7 @@ def documents(
     """Return what is committed beside the entries by name: page, tables and the published file."""
     files: dict[str, str | bytes] = {PAGE: page(by_board, suites, site=f"{SITE}/{site.PAGE}")}
     for section in by_board:
-        files[section.file("ranking")] = ranking_csv(section.ranks, section.trust)
+        files[section.file("ranking")] = ranking_csv(section.ranks)
         files[section.file("comparisons")] = comparisons_csv(section.ranks)
     files[PUBLISHED] = published_bytes(by_board, suites)
     return files
@@ -102,13 +103,13 @@ def cells(sections: Sequence[LeaderboardSection], suites: Sequence[SuiteSection]
         for row in section.ranks.standings:
             entry = section.sources[row.entry]
             flags = {"primary": row.primary, "trivial": row.trivial}
-            about = _origin("leaderboard", entry.meta.id, entry.trust, **flags)
+            about = _origin("leaderboard", entry.meta.id, **flags)
             lines += [(about, r) for r in row.records]
     for suite in suites:
         first = primary_settings(suite.board.records)
         for r in suite.board.records:
             flags = {"primary": r.setting in first, "trivial": suite.board.is_trivial(r.setting)}
-            lines.append((_origin(suite.name, "", "", **flags), r))
+            lines.append((_origin(suite.name, "", **flags), r))
     return compress(cells_csv(lines).encode())
 
 
@@ -215,7 +216,7 @@ def _section(section: LeaderboardSection) -> str:
         f"{_who_ran(section.entries)}\n",
         *(f"> {escape(e.id)}: {escape(e.caption)}\n" for e in about if e.caption),
         f"**{escape(body.verdict)}**\n",
-        markdown_table(tables.ranking(ranks, section.trust)),
+        markdown_table(tables.ranking(ranks)),
         TEXTS["legend" if board.paired else "unpaired-legend"],
         *markdown_list(tables.ranking_notes(ranks)),
         "",
@@ -229,7 +230,7 @@ def _verdict(ranks: RankedBoard) -> str:
 
     A single comparison of two rows is not corrected for all pairs of the board, as ranks are.
     """
-    first = [str(s.entry) for s in ranks.standings if s.rank == 1 and s.primary and not s.below]
+    first = [str(s.entry) for s in ranks.standings if s.rank == 1 and s.primary]
     if len(first) < 2:
         return verdict_of(ranks.board)
     return (
@@ -239,25 +240,12 @@ def _verdict(ranks: RankedBoard) -> str:
 
 
 def _who_ran(entries: Sequence[SubmittedEntry]) -> str:
-    """Return who ran the detectors of a board, and which of them somebody ran or scored again."""
+    """Return that rows are reported, and by whom."""
     ran: dict[str, set[str]] = {}
-    again: dict[tuple[str, str], set[str]] = {}
-    everywhere = {record.environment for entry in entries for record in entry.records}
     for entry in entries:
         ran.setdefault(entry.meta.submitter or "nobody named", set()).update(entry.meta.detectors)
-        if grant := entry.grant:
-            places = grant.environments if set(grant.environments) != everywhere else []
-            where = f" in {listed([*map(title_of, places)], 7)} alone" if places else ""
-            of = again.setdefault((grant.trust, f"{grant.by}{where}"), set())
-            of.update(grant.means or entry.meta.detectors)
     rows = [f"{who} ({counted(len(names), 'detector(s)')})" for who, names in sorted(ran.items())]
-    parts = [f"Run by {', '.join(rows)}."]
-    for (trust, who), names in sorted(again.items()):
-        parts.append(f"{trust.capitalize()} by {who}: {', '.join(sorted(names))}.")
-    rest = set().union(*ran.values()) - set().union(*again.values())
-    parts += ["Nobody has run or scored the others again."] if again and rest else []
-    parts += [] if again else ["Nobody has run or scored them again."]
-    return escape(" ".join(parts))
+    return escape(f"{REPORTED} Run by {', '.join(rows)}.")
 
 
 def _suite(section: SuiteSection) -> str:
@@ -299,8 +287,6 @@ def _of_paper(ranks: RankedBoard) -> list[Table]:
 def _entry(entry: SubmittedEntry) -> str:
     """Return who submitted an entry, and all that is known of how it was made."""
     meta = entry.meta
-    grant = entry.grant
-    granted = f", by {grant.by} on {grant.day}: {grant.how}" if grant else ""
     text = "{distribution} {version} (plug-in {plugin}, source {source_digest:.12})"
     plugins = [text.format(**plugin) for plugin in meta.plugins]
     packages = sorted(meta.environment.get("packages", {}).items())
@@ -309,7 +295,6 @@ def _entry(entry: SubmittedEntry) -> str:
         ("Detectors", ", ".join(sorted(meta.detectors))),
         ("Split", f"{meta.split}, digest {meta.split_digest[:12]}, protocol {meta.protocol}"),
         ("Submitted by", f"{meta.submitter or 'nobody named'}, {meta.created}"),
-        ("Trust level", f"{entry.trust}{granted}"),
         ("Citation", meta.citation),
         ("Plug-ins", "; ".join(plugins)),
         ("Platform", f"{python}, {meta.environment.get('platform', '')}"),

@@ -5,32 +5,26 @@
     entry.json       what it is, who submits it, and the digest of every other file
     records.jsonl    one record a line, as in a results directory
     curves.json      illustrations computed from the scores (optional)
-    scores/*.h5      every score, as in a results directory (optional)
 
 Records or curves of more than a megabyte are compressed: ``records.jsonl.xz``, ``curves.json.xz``.
 
 Entries are read here after they were verified (`oodd_leaderboard.verify`): the shape of
 ``entry.json`` and of each record is checked, their truth is not.
-
-Levels of trust are granted by maintainers in one file, ``trust.json``, which lies beside the
-directory of the entries, so that no entry can write it. A grant names the digest of an
-``entry.json``, which has the digests of all other files: a changed entry has lost its grant.
 """
 
-import hashlib
 import json
 import re
 import shlex
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final, Literal, TypeVar, get_args
+from typing import Any, ClassVar, Final
 
-from pydantic import AfterValidator, TypeAdapter, ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from oodd_eval.data.bounded import MANIFEST_BYTES, read_bytes
 from oodd_eval.data.facts import ENVIRONMENTS, TABLE1
-from oodd_eval.data.files import find_file, write_text
+from oodd_eval.data.files import find_file
 from oodd_eval.errors import ResultsError
 from oodd_eval.prose import Table
 from oodd_eval.results.board import Board, boards, expected_cells, grouped
@@ -41,18 +35,13 @@ from oodd_eval.results.standings import RankedBoard, primary_settings, ranked
 from oodd_eval.results.strengths import StrengthTables
 from oodd_eval.results.tables import Tables
 
-_T = TypeVar("_T")
-
 SCHEMA: Final = 3  # version of the layout of an entry; a reader refuses others
 
 ENTRY: Final = "entry.json"
 CURVES: Final = "curves.json"
-SCORES: Final = "scores"
-GRANTS: Final = "trust.json"
 
-Means = dict[str, dict[str, tuple[float, float]]]
-Trust = Literal["reported", "re-scored", "re-run"]
-TRUST: Final[tuple[Trust, ...]] = get_args(Trust)  # levels of trust, the lowest first
+REPORTED: Final = "Every row is reported by its author: the numbers are not verified."
+"""Stands at the head of every board."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,56 +80,13 @@ class EntryInfo:
         return json.dumps(asdict(self), indent=1, sort_keys=True, ensure_ascii=False) + "\n"
 
 
-def _printable(text: str) -> str:
-    if not text.isprintable():
-        raise ValueError(f"{text!a:.60} is no line of printable text")
-    return text
-
-
-Printable = Annotated[str, AfterValidator(_printable)]
-
-
-@dataclass(frozen=True, slots=True)
-class Grant:
-    """A level of trust above ``"reported"``, of the entry whose ``entry.json`` has a digest.
-
-    `by` is who granted it, `day` when (ISO 8601), and `how` what was compared with what. `means`
-    are over the cells that a re-run has, by row and metric: the entry's, and the re-run's. They
-    are of these `environments`.
-    """
-
-    entry: str
-    trust: Literal["re-scored", "re-run"]
-    by: Printable
-    day: Printable
-    how: Printable
-    means: Means = field(default_factory=dict)
-    environments: list[str] = field(default_factory=list)
-
-    __pydantic_config__: ClassVar = {"extra": "forbid", "strict": True}
-
-
-@dataclass(frozen=True, slots=True)
-class _GrantsLayout:
-    schema: Literal[1]  # version of the layout; others are refused
-    grants: dict[str, Grant]
-
-    __pydantic_config__: ClassVar = {"extra": "forbid", "strict": True}
-
-
 @dataclass(frozen=True, slots=True)
 class SubmittedEntry:
-    """An entry that was read: `meta` is ``entry.json``, `path` its directory, `grant` its trust."""
+    """An entry that was read: `meta` is ``entry.json``, `path` its directory."""
 
     path: Path
     meta: EntryInfo
     records: list[Record]
-    grant: Grant | None = None
-
-    @property
-    def trust(self) -> Trust:
-        """The level of trust that was granted."""
-        return self.grant.trust if self.grant else "reported"
 
     @property
     def commands(self) -> list[str]:
@@ -194,34 +140,23 @@ def _in_order(item: tuple[Setting, object]) -> tuple[bool, int, str]:
 def read_entry(path: Path | str) -> SubmittedEntry:
     """Read the entry in a directory; ResultsError when it cannot be read."""
     file = Path(path) / ENTRY
-    meta = read_json(EntryInfo, file, "is no entry")
+    meta = _read_info(file)
     if meta.schema != SCHEMA:
         raise ResultsError(
             f"{str(file)!r}: schema is {meta.schema}, expected {SCHEMA}: it was written by another "
             "version of oodd-eval"
         )
-    grant = read_grants(file.absolute().parents[1]).get(meta.id)
-    granted = (
-        grant and grant.entry == digest_of(file.read_bytes()) and _has_its_files(file.parent, meta)
-    )
-    records = ResultsDirectory(path).records()
-    return SubmittedEntry(file.parent, meta, records, grant if granted else None)
+    return SubmittedEntry(file.parent, meta, ResultsDirectory(path).records())
 
 
-def _has_its_files(directory: Path, meta: EntryInfo) -> bool:
-    """Tell whether the files that an entry names are as it says: a grant is of these."""
-    named = {directory / name: known.get("sha256") for name, known in meta.files.items()}
-    return all(p.is_file() and digest_of(p.read_bytes()) == digest for p, digest in named.items())
-
-
-def read_json(kind: type[_T], file: Path, problem: str) -> _T:
-    """Read a dataclass from a JSON file; `ResultsError` says a `problem` and why."""
+def _read_info(file: Path) -> EntryInfo:
+    """Read ``entry.json``; `ResultsError` says which of its fields is wrong."""
     try:
-        return TypeAdapter(kind).validate_json(read_bytes(file, MANIFEST_BYTES, ResultsError))
+        return TypeAdapter(EntryInfo).validate_json(read_bytes(file, MANIFEST_BYTES, ResultsError))
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        why = f"{problem}: {'.'.join(map(str, first['loc']))}: {first['msg']}"
-    raise ResultsError(f"{str(file)!r} {why}")
+        why = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+    raise ResultsError(f"{str(file)!r} is no entry: {why}")
 
 
 def read_entries(root: Path | str) -> list[SubmittedEntry]:
@@ -261,30 +196,6 @@ def recorded_plugins(records: Iterable[Record]) -> list[dict[str, str]]:
     return [dict(zip(names, (*p.split(":", 1), *source), strict=True)) for p, *source in used]
 
 
-def digest_of(content: bytes) -> str:
-    """Return the SHA-256 digest of the bytes of a file, as grants and entries name it."""
-    return hashlib.sha256(content).hexdigest()
-
-
-def read_grants(results: Path) -> dict[str, Grant]:
-    """Return the grants beside a directory of entries, by the entry's name.
-
-    `ResultsError`: the file is not of its format.
-    """
-    file = results.absolute().parent / GRANTS
-    if not file.exists():
-        return {}
-    return read_json(_GrantsLayout, file, "holds no grants, restore it from the history").grants
-
-
-def write_grants(results: Path, grants: Mapping[str, Grant]) -> Path:
-    """Write the grants beside a directory of entries, and return the file."""
-    file = results.absolute().parent / GRANTS
-    layout = _GrantsLayout(1, dict(sorted(grants.items())))
-    write_text(file, json.dumps(asdict(layout), indent=1, sort_keys=True) + "\n")
-    return file
-
-
 TABLES: Final = "tables"  # directory of the CSV files
 SUITES: Final = "suites"  # directory of results on further test suites, one directory a split
 
@@ -299,11 +210,6 @@ class LeaderboardSection:
     ranks: RankedBoard
     entries: list[SubmittedEntry]
     sources: dict[Setting, SubmittedEntry]
-
-    @property
-    def trust(self) -> dict[Setting, Trust]:
-        """Trust level by row: that of its entry."""
-        return {row: entry.trust for row, entry in self.sources.items()}
 
     @property
     def name(self) -> str:
@@ -374,22 +280,19 @@ def sections(entries: Sequence[SubmittedEntry]) -> list[LeaderboardSection]:
     by_board = []
     for board in boards(records):
         sources = {r.setting: owners[row_of(r)] for r in board.records}
-        rerun = {row for row, entry in sources.items() if entry.trust == "re-run"}
-        ranks = ranked(board.records, _primary(board.records, sources, rerun), rerun)
+        ranks = ranked(board.records, _primary(board.records, sources))
         by_id = {entry.meta.id: entry for entry in sources.values()}
         by_board.append(LeaderboardSection(ranks, [by_id[i] for i in sorted(by_id)], sources))
     return sorted(by_board, key=lambda section: section.order)
 
 
-def _primary(
-    records: Sequence[Record], sources: Mapping[Setting, SubmittedEntry], rerun: Collection[Setting]
-) -> set[Setting]:
+def _primary(records: Sequence[Record], sources: Mapping[Setting, SubmittedEntry]) -> set[Setting]:
     """Return the primary row of each detector: what its entry declares, else the usual one.
 
     A declared row takes the place of another. So the entry has to be the only one with rows of the
     detector, or it would push somebody else's row out of the ranking, and its row has to be whole.
     """
-    primary = {row.detector: row for row in primary_settings(records, rerun)}
+    primary = {row.detector: row for row in primary_settings(records)}
     expected = expected_cells(records)
     by_row = grouped(records, lambda r: r.setting)
     cells = {row: expected & {r.position for r in rows} for row, rows in by_row.items()}

@@ -131,7 +131,7 @@ def _title(metric: str) -> str:
 def _sentence(entry: SubmittedEntry, board: Board, row: Setting) -> str:
     return (
         f"{row} on split {board.split} of oodd-eval (digest {board.digest[:12]}, protocol "
-        f"{board.protocol}), entry {entry.meta.id}, trust level {entry.trust}."
+        f"{board.protocol}), entry {entry.meta.id}, reported by its author."
     )
 
 

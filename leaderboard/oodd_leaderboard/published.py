@@ -2,20 +2,19 @@
 
 ``leaderboard build`` writes the file, the wheel ships it. It holds the records of all entries
 without what no ranking needs, as lines of JSON, compressed. Each record's provenance says which
-entry it is from, at which level of trust, and whether its row is primary. A run is placed by the
-code that ranks the board itself. Of further test suites with several strengths it has the table of
-detection thresholds.
+entry it is from, and whether its row is primary. A run is placed by the code that ranks the board
+itself. Of further test suites with several strengths it has the table of detection thresholds.
 """
 
 import json
 import lzma
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, NamedTuple
 
 from oodd_eval.errors import ResultsError, UsageError
-from oodd_eval.metrics.catalogue import FOUND_WITHIN, UNDEFINED, metric_info
+from oodd_eval.metrics.catalogue import FOUND_WITHIN, metric_info
 from oodd_eval.metrics.ranking import PairTest, Ranking
 from oodd_eval.names import counted
 from oodd_eval.prose import Table
@@ -39,7 +38,7 @@ from oodd_eval.results.standings import (
     primary_settings,
     ranked,
 )
-from oodd_eval.results.tables import texts
+from oodd_eval.results.tables import printed_rank, texts
 from oodd_leaderboard.entry import LeaderboardSection, SuiteSection
 
 PUBLISHED: Final = "published.jsonl.xz"
@@ -64,21 +63,15 @@ _OF_SUITE: Final = '{"suite": '  # begins the line of a further suite
 
 @dataclass(frozen=True, slots=True)
 class PublishedBoard:
-    """One board: its records, and by row the entry's id and trust; `primary` are primary rows."""
+    """One board: its records, and by row the entry's id; `primary` are primary rows."""
 
     records: list[Record]
     entries: dict[Setting, str]
-    trust: dict[Setting, str]
     primary: set[Setting]
 
     def ranks(self) -> RankedBoard:
         """Return the board's rankings, those of the page."""
-        return ranked(self.records, self.primary, self.rerun)
-
-    @property
-    def rerun(self) -> set[Setting]:
-        """The rows that were run again, which alone are ranked where there are any."""
-        return {row for row, trust in self.trust.items() if trust == "re-run"}
+        return ranked(self.records, self.primary)
 
     @property
     def conditions(self) -> Conditions:
@@ -114,7 +107,6 @@ def published_bytes(
             record,
             kept_metrics(section.ranks.board.records),
             entry=section.sources[row.entry].meta.id,
-            trust=section.trust[row.entry],
             primary=row.primary,
         )
         for section in sections
@@ -161,11 +153,9 @@ def read_published(file: Path | None = None) -> Published:
     published = []
     for board in boards(read_records(file, matches=is_record)):
         origin = {r.setting: r.provenance for r in board.records}
-        entries, trust = (
-            {row: about[k] for row, about in origin.items()} for k in ("entry", "trust")
-        )
+        entries = {row: about["entry"] for row, about in origin.items()}
         primary = {row for row, about in origin.items() if about["primary"]}
-        published.append(PublishedBoard(board.records, entries, trust, primary))
+        published.append(PublishedBoard(board.records, entries, primary))
     return Published(published, suites)
 
 
@@ -241,11 +231,11 @@ class Placement(NamedTuple):
 def placement(
     records: Sequence[Record], board: PublishedBoard, primary: Collection[str] = ()
 ) -> Placement:
-    """Place the rows of a run among those of a board, as if they had been run again.
+    """Place the rows of a run among those of a board.
 
-    A row that the board has with the same numbers keeps its place and its trust. Another row of
-    the same name takes the place of the board's. `primary` are the rows that an entry declares
-    for its detectors. `UsageError`: the rows of the run have no cell in common.
+    A row that the board has with the same numbers keeps its place. Another row of the same
+    name takes the place of the board's. `primary` are the rows that an entry declares for its
+    detectors. `UsageError`: the rows of the run have no cell in common.
     """
     kept = kept_metrics(board.records)
     by_row = grouped((slim(r, kept) for r in records), lambda r: r.setting)
@@ -271,7 +261,7 @@ def placement(
     used = [r for rows in (on_board | new).values() for r in rows if r.position in cells]
     lacking = {row: _lacking(rows, expected) for row, rows in new.items()}
     return Placement(
-        ranks=ranked(used, first, board.rerun and board.rerun | new.keys(), expected=cells),
+        ranks=ranked(used, first, expected=cells),
         rows=set(by_row),
         published=same,
         replaced=set(replaced),
@@ -316,35 +306,29 @@ def printed_name(row: Standing, marked: Collection[Setting] = ()) -> str:
     return f"{MARK * (row.entry in marked)}{row.entry}{row.marks}"
 
 
-def rankings(
-    ranks: RankedBoard, trust: Mapping[Setting, str], marked: Collection[Setting] = ()
-) -> list[Table]:
+def rankings(ranks: RankedBoard, marked: Collection[Setting] = ()) -> list[Table]:
     """Return the ranking by separability and that by guaranteed alarms, some rows `marked`.
 
-    Trust is by row; a row without is of no entry. Letters of tie groups stand behind a rank.
+    Letters of tie groups stand behind a rank.
     """
     by_scores, by_alarms = (
         metric_info(n) for n in (ranks.board.ranking, ranks.board.alarm_ranking)
     )
 
-    def rows(
-        standings: Iterable[Standing], ranking: Ranking, *metrics: str
-    ) -> list[tuple[Setting, list[str]]]:
+    def rows(standings: Iterable[Standing], ranking: Ranking, *metrics: str) -> list[list[str]]:
         columns = [Column(name, intervals=name == metrics[0]) for name in metrics]
         lines = []
         for row in standings:
             label = str(row.entry)
-            letters = ranking.letters(str(row.clone_of or row.entry))
-            rank = f"{row.printed(ranking.ranks.get(label))} {letters}".rstrip()
+            letters = ranking.letters(label)
+            rank = f"{printed_rank(ranking.ranks.get(label))} {letters}".rstrip()
             labels = [rank, printed_name(row, marked)]
-            lines.append((row.entry, [*labels, *texts(ranks.board, row.entry, columns)]))
+            lines.append([*labels, *texts(ranks.board, row.entry, columns)])
         return lines
 
     by_separability = rows(ranks.standings, ranks.ranking, by_scores.name)
     order = {row: i for i, row in enumerate(ranks.alarms.ranks)}
-    standings = sorted(
-        ranks.standings, key=lambda row: (row.below, order.get(str(row.entry), len(order)))
-    )
+    standings = sorted(ranks.standings, key=lambda row: order.get(str(row.entry), len(order)))
     level, suffix = f"at {by_alarms.level}", ranks.board.level
     names = [f"{name}_{suffix}" for name in _BESIDE]
     if not ranks.board.paired:
@@ -359,14 +343,14 @@ def rankings(
     return [
         Table(
             f"Ranking by separability: {by_scores.title} (%), higher is better",
-            ["rank", "row", by_scores.title, "trust"],
-            [[*line, trust.get(entry, UNDEFINED)] for entry, line in by_separability],
+            ["rank", "row", by_scores.title],
+            by_separability,
             labels=2,
         ),
         Table(
             f"Ranking by guaranteed alarms {level}: {what}, {by_alarms.better} is better",
             ["rank", "row", *header],
-            [line for _, line in lines],
+            lines,
             labels=2,
             note=_DELAYS if censored else "",
         ),
@@ -385,9 +369,8 @@ def neighbours(ranks: RankedBoard, row: Setting) -> Table | None:
     Differences are paired, with 95 % intervals, in the metric's own unit. None: it has no rank.
     """
     lines = []
-    near = {str(s.entry) for s in ranks.standings if s.primary and not s.below}
-    originals = {s.entry: s.clone_of for s in ranks.standings}
-    label = str(originals.get(row) or row)
+    near = {str(s.entry) for s in ranks.standings if s.primary}
+    label = str(row)
     by_scores, by_alarms = (
         metric_info(n) for n in (ranks.board.ranking, ranks.board.alarm_ranking)
     )

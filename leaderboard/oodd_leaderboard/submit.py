@@ -1,7 +1,6 @@
 """Write an entry of the leaderboard from a results directory."""
 
 import os
-import shutil
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -20,7 +19,7 @@ from oodd_eval.results.record import Record
 from oodd_eval.results.standings import primary_settings
 from oodd_leaderboard import entry as stored
 from oodd_leaderboard.curve_file import make_curves, write_curves
-from oodd_leaderboard.entry import CURVES, ENTRY, SCORES, EntryInfo
+from oodd_leaderboard.entry import CURVES, ENTRY, EntryInfo
 from oodd_leaderboard.verify import EntryVerdict, Neighbours, find_split, formats, verify_entry
 
 LARGE: Final = 10 * 10**6  # bytes of a large entry: a repository keeps every version of it
@@ -60,7 +59,6 @@ def submit(
     detectors: str = "all",
     cells: str = "",
     complete: bool = False,
-    scores: bool = False,
     curves: Extent = "rows",
     split: str | Path | None = None,
 ) -> Submission:
@@ -80,14 +78,9 @@ def submit(
         opened, _ = find_split(records[0].split, records[0].split_digest, split)
         drawn = with_curves(records, curves)
         if opened is not None and drawn:
-            _score_files(drawn, source, "submit with --curves none, or")
+            _require_scores(drawn, source)
             write_curves(make_curves(drawn, source, opened), directory / CURVES)
             compress_large(directory / CURVES)
-        if scores:
-            (directory / SCORES).mkdir()
-            evaluated = [record for record in records if record.ok]
-            for file in _score_files(evaluated, source, "leave out --scores, or"):
-                shutil.copyfile(file, directory / SCORES / file.name)
         entry = replace(
             entry,
             files={
@@ -229,14 +222,13 @@ def _info(records: Sequence[Record], statement: Statement) -> EntryInfo:
     )
 
 
-def _score_files(records: Iterable[Record], source: ResultsDirectory, instead: str) -> list[Path]:
-    """Return the score files of records, each once; refuse when one is not there."""
-    files = {r.scores: source.path / SCORES / f"{r.scores}.h5" for r in records}
-    for key, file in files.items():
+def _require_scores(records: Iterable[Record], source: ResultsDirectory) -> None:
+    """Raise `UsageError` when a score file of the records is not there."""
+    for key in {r.scores for r in records}:
+        file = source.path / "scores" / f"{key}.h5"
         if formats.complaint(formats.SCORE_KEY, key) or not file.is_file():
-            advice = f"{instead} run again into this directory"
+            advice = "submit with --curves none, or run again into this directory"
             raise UsageError(f"scores are not there in {str(file)!r}: {advice}")
-    return list(files.values())
 
 
 @contextmanager

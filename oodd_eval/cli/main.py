@@ -59,7 +59,6 @@ LEADERBOARD: Final[Commands] = {
         "oodd_leaderboard.commands.entries:submit",
     ),
     "verify": ("check entries as data", "oodd_leaderboard.commands.entries:verify"),
-    "rerun": ("run an entry again on new seeds (extra sim)", "oodd_recording.rerun:rerun"),
     "build": ("render tables and site from the entries", "oodd_leaderboard.commands.entries:build"),
 }
 

@@ -3,18 +3,16 @@
 import contextlib
 import math
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
-
-import numpy as np
 
 from oodd_eval.data.facts import ENVIRONMENTS, in_order, title_of
 from oodd_eval.errors import ResultsError, UnknownNameError, UsageError
 from oodd_eval.metrics.auc import Contribution
 from oodd_eval.metrics.bootstrap import nan_mean
-from oodd_eval.metrics.catalogue import LEVELS, RANKING, UNDEFINED, metric_info
-from oodd_eval.metrics.ranking import ALPHA, Lead, Position, Ranking, Row, leads, rank, win_rates
+from oodd_eval.metrics.catalogue import LEVELS, RANKING, metric_info
+from oodd_eval.metrics.ranking import ALPHA, Position, Ranking, Row, leads, rank, win_rates
 from oodd_eval.names import counted
 from oodd_eval.plugins.contract import Training, training_mark
 from oodd_eval.results.board import (
@@ -47,19 +45,16 @@ class Standing:
 
     `rank` is None, and `state` says why, for a row that is not ranked; `alarm_rank` is its rank by
     alarms, None where `alarm_state` says why. `primary` rows are one a detector; the others are
-    variants, whose rank is the one that they would have. So is that of a row `below` the ranking,
-    which was not run again where others were. A row whose scores are another's is a clone: it has
-    the rank of the row that `clone_of` names, and pushes nobody down. `ties` are the letters of its
-    tie groups, `wins` is the mean of its win rates against the other ranked rows, `lead` says how
-    often its mean stays above the next row's without one of the environments, empty for the last
-    row, and `inputs` is empty where no record names the detector's inputs.
+    variants, whose rank is the one that they would have. `ties` are the letters of its tie groups,
+    `wins` is the mean of its win rates against the other ranked rows, `lead` says how often its
+    mean stays above the next row's without one of the environments, empty for the last row, and
+    `inputs` is empty where no record names the detector's inputs.
     """
 
     entry: Setting
     records: list[Record]
     trivial: bool
     primary: bool
-    below: bool
     rank: int | None
     alarm_rank: int | None
     ties: str
@@ -69,16 +64,11 @@ class Standing:
     lead: str
     inputs: str
     cost: Cost
-    clone_of: Setting | None = None
 
     @property
     def seeds(self) -> int:
         """The number of detector seeds."""
         return len({r.seed for r in self.records})
-
-    def printed(self, rank: int | None) -> str:
-        """Return a rank as printed: in brackets where it is the one that the row would have."""
-        return UNDEFINED if rank is None else f"({rank})" if self.below else str(rank)
 
     @property
     def training(self) -> Training:
@@ -87,9 +77,8 @@ class Standing:
 
     @property
     def marks(self) -> str:
-        """The marks printed behind a row's name: trivial, variant, clone, other training data."""
+        """The marks printed behind a row's name: trivial, variant, other training data."""
         marks = " (trivial)" * self.trivial + " (variant)" * (not self.primary)
-        marks += f" (= {self.clone_of})" if self.clone_of else ""
         mark = training_mark(self.training)
         return marks + (f" ({mark})" if mark else "")
 
@@ -97,10 +86,8 @@ class Standing:
 class RankedBoard(NamedTuple):
     """A board with its rankings and win rates, by the labels of the ranked rows.
 
-    All have the order of the standings: ranked rows by rank and mean, then the others by name, and
-    last what stands below the ranking, likewise.
-    `alarms` is the ranking by alarms; it has no rows where the board lacks that metric. A clone has
-    the rank of its original, and is in no comparison.
+    All have the order of the standings: ranked rows by rank and mean, then the others by name.
+    `alarms` is the ranking by alarms; it has no rows where the board lacks that metric.
     """
 
     board: Board
@@ -110,20 +97,19 @@ class RankedBoard(NamedTuple):
     rates: dict[tuple[str, str], float]
 
 
-def primary_settings(records: Iterable[Record], rerun: Collection[Setting] = ()) -> set[Setting]:
+def primary_settings(records: Iterable[Record]) -> set[Setting]:
     """Return one row of each detector: of those with most cells and seeds enough the simplest.
 
     That is the row with the fewest other than default parameters, and then the least horizon. Cells
-    and seeds come first, so that part of a row does not stand for a detector that has a whole one,
-    and `rerun` rows before all, so that nobody's claim takes the place of what was confirmed. Only
-    `expected_cells` count.
+    and seeds come first, so that part of a row does not stand for a detector that has a whole one.
+    Only `expected_cells` count.
     """
     by_row = grouped(records, lambda r: r.setting)
     expected = expected_cells([r for rows in by_row.values() for r in rows])
 
     def order(row: Setting) -> tuple[Any, ...]:
         cells, few = expected & {r.position for r in by_row[row]}, has_few_seeds(by_row[row])
-        return row not in rerun, -len(cells), few, len(row.parameters), *_name(row)
+        return -len(cells), few, len(row.parameters), *_name(row)
 
     chosen: dict[str, Setting] = {}
     for row in sorted(by_row, key=order):
@@ -134,7 +120,6 @@ def primary_settings(records: Iterable[Record], rerun: Collection[Setting] = ())
 def ranked(
     records: Sequence[Record],
     primary: Collection[Setting] | None = None,
-    rerun: Collection[Setting] = (),
     *,
     expected: Collection[Position] = (),
 ) -> RankedBoard:
@@ -147,9 +132,6 @@ def ranked(
     primary
         Rows that push others down, one a detector; by default `primary_settings`. They need three
         detector seeds, unless the seed changes nothing.
-    rerun
-        Rows that were run again. Where there are any, others stand below these and push nobody
-        down.
     expected
         Environments and conditions that a ranked row needs; by default `expected_cells`. Records
         of other cells change no rank.
@@ -173,7 +155,6 @@ def ranked(
         )
     first = primary_settings(records) if primary is None else set(primary)
     cells = set(expected or expected_cells(records))
-    below = set(by_row).difference(rerun) if rerun else set()
 
     counted: dict[str, dict[Setting, list[Record]]] = {}
     states: dict[str, dict[Setting, str]] = {}
@@ -187,16 +168,14 @@ def ranked(
         states[metric] = {
             e: _state(rows, compared, metric, e in first) for e, rows in counted[metric].items()
         }
-    complete = {e: rows for e, rows in counted[by_scores].items() if not states[by_scores][e]}
-    clones = _clones(complete, (by_scores, by_alarms), below, first)
 
     def ranking_by(metric: str) -> tuple[Ranking, dict[str, Row]]:
         rows = {
             str(e): terms_of(counted[metric][e], metric)
             for e, state in states[metric].items()
-            if not state and e not in clones
+            if not state
         }
-        return rank(rows, set(map(str, first - below))), rows
+        return rank(rows, set(map(str, first))), rows
 
     ranking, rows = ranking_by(by_scores)
     alarms, _ = ranking_by(by_alarms)
@@ -209,21 +188,12 @@ def ranked(
             for label, of_row in seeds.items()
         }
     )
-    unranked = set(map(str, below))
     wins: dict[str, list[float]] = {}
-    for (row, against), rate in rates.items():
-        if against not in unranked:
-            wins.setdefault(row, []).append(rate)
-    lead: dict[str, Lead] = {}
-    for part in (False, True):
-        lead |= leads(
-            {label: rows[label] for label in ranking.ranks if (label in unranked) == part}
-        )
-    ranking, alarms = (_with_clones(one, clones) for one in (ranking, alarms))
+    for (row, _), rate in rates.items():
+        wins.setdefault(row, []).append(rate)
+    lead = leads({label: rows[label] for label in ranking.ranks})
     positions = {label: i for i, label in enumerate(ranking.ranks)}
-    order = sorted(
-        by_row, key=lambda e: (e in below, positions.get(str(e), len(positions)), _name(e))
-    )
+    order = sorted(by_row, key=lambda e: (positions.get(str(e), len(positions)), _name(e)))
     board = Board([record for entry in order for record in by_row[entry]], cells)
     standings = [
         Standing(
@@ -231,72 +201,19 @@ def ranked(
             records=by_row[entry],
             trivial=board.is_trivial(entry),
             primary=entry in first,
-            below=entry in below,
             rank=ranking.ranks.get(str(entry)),
             alarm_rank=alarms.ranks.get(str(entry)),
-            ties=ranking.letters(str(clones.get(entry, entry))),
+            ties=ranking.letters(str(entry)),
             state=states[by_scores][entry],
             alarm_state=states[by_alarms][entry],
-            wins=nan_mean(wins.get(str(clones.get(entry, entry)), ())),
-            lead=str(lead.get(str(clones.get(entry, entry)), "")),
+            wins=nan_mean(wins.get(str(entry), ())),
+            lead=str(lead.get(str(entry), "")),
             inputs=next((r.inputs for r in by_row[entry] if r.inputs), ""),
             cost=cost_of(by_row[entry]),
-            clone_of=clones.get(entry),
         )
         for entry in order
     ]
     return RankedBoard(board, standings, ranking, alarms, rates)
-
-
-def _clones(
-    rows: Mapping[Setting, Sequence[Record]],
-    metrics: tuple[str, str],
-    below: Collection[Setting],
-    first: Collection[Setting],
-) -> dict[Setting, Setting]:
-    """Return the rows whose scores are another's, and whose they are.
-
-    Rows are whole. Two of them are equal where their terms of both rankings are, in every cell with
-    every detector seed that both have. A row whose episodes have all one number in every cell, such
-    as `clock`, is equal to none by that. The original is a row that was run again before one that
-    was not, one of this distribution, a primary one, one with fewer parameters, and last the first
-    by name.
-    """
-    terms: dict[Setting, dict[tuple[int, Position], int]] = {}
-    for row, records in rows.items():
-        by_scores = [r.per_trajectory[metrics[0]][0] for r in records]
-        if any(len(values) and np.ptp(values) for values in by_scores):
-            terms[row] = {
-                (r.seed, r.position): hash(
-                    tuple(r.per_trajectory[m].tobytes() for m in metrics if m in r.per_trajectory)
-                )
-                for r in records
-            }
-
-    def order(row: Setting) -> tuple[Any, ...]:
-        foreign = not rows[row][0].plugin.startswith("oodd-eval:")
-        return row in below, foreign, row not in first, len(row.parameters), *_name(row)
-
-    originals: list[Setting] = []
-    clones: dict[Setting, Setting] = {}
-    for row in sorted(terms, key=order):
-        for other in originals:
-            common = terms[row].keys() & terms[other].keys()
-            if common and all(terms[row][key] == terms[other][key] for key in common):
-                clones[row] = other
-                break
-        else:
-            originals.append(row)
-    return clones
-
-
-def _with_clones(ranking: Ranking, clones: Mapping[Setting, Setting]) -> Ranking:
-    """Return a ranking in which clones stand behind their originals, with the same rank."""
-    labels = grouped(clones, lambda clone: str(clones[clone]))
-    ranks: dict[str, int] = {}
-    for label, number in ranking.ranks.items():
-        ranks |= dict.fromkeys([label, *map(str, labels.get(label, ()))], number)
-    return replace(ranking, ranks=ranks)
 
 
 def terms_of(records: Iterable[Record], metric: str) -> Row:

@@ -455,8 +455,8 @@ def failures(board: Board) -> Table | None:
     return Table("Failures", header, rows, labels=4) if rows else None
 
 
-def ranking(ranks: RankedBoard, trust: Mapping[Setting, str]) -> Table:
-    """Return ranks by separability, with what a reader needs to judge them; trust is by row."""
+def ranking(ranks: RankedBoard) -> Table:
+    """Return ranks by separability, with what a reader needs to judge them."""
     board = ranks.board
     title = metric_info(board.ranking).title
     columns = [c._replace(intervals=True) for c in by_group(board, title)]
@@ -467,13 +467,12 @@ def ranking(ranks: RankedBoard, trust: Mapping[Setting, str]) -> Table:
     for row in ranks.standings:
         rank, detector, settings = _labels(row)
         inputs = row.inputs.replace("observations+actions", "+actions") or UNDEFINED
-        labels = [rank, row.ties or UNDEFINED, row.printed(row.alarm_rank), detector, settings]
-        labels += [inputs, trust.get(row.entry, UNDEFINED)]
+        labels = [rank, row.ties or UNDEFINED, printed_rank(row.alarm_rank), detector, settings]
         means = texts(board, row.entry, columns)
-        rows.append([*labels, *means, _percent(row.wins), row.lead or UNDEFINED])
-    labels = ["rank", "ties", "alarm rank", "detector", "settings", "inputs", "trust"]
+        rows.append([*labels, inputs, *means, _percent(row.wins), row.lead or UNDEFINED])
+    labels = ["rank", "ties", "alarm rank", "detector", "settings", "inputs"]
     header = [*labels, *(c.title for c in columns), "win rate", "lead"]
-    return Table(f"Ranking by {title} (%)", header, rows, labels=7)
+    return Table(f"Ranking by {title} (%)", header, rows, labels=6)
 
 
 _BESIDE: Final = {
@@ -653,22 +652,12 @@ def ranking_notes(
             "A variant is a further row of a detector. It has the rank that it would have, and "
             "pushes no other row down."
         )
-    if any(row.clone_of for row in rows):
-        lines.append(
-            "A row with = and another's name has that row's scores. It has the same rank, and "
-            "pushes no other row down."
-        )
     if any(row.training not in {"nominal", "oracle"} for row in rows):
         lines.append("Rows trained on more than nominal trajectories of the split are not ranked.")
     if any(row.training == "oracle" for row in rows):
         lines.append(
             "An oracle has the true equations of the environment. It says how far the limit is, "
             "and is not ranked."
-        )
-    if any(row.below for row in rows):
-        lines.append(
-            "Ranked are rows that maintainers have run again on seeds of their own. The others "
-            "stand below, in brackets the rank that they would have, and push no row down."
         )
     if whole and any(row.lead for row in rows):
         lines.append(
@@ -698,12 +687,17 @@ _RANK: Final = (
 )
 
 
+def printed_rank(rank: int | None) -> str:
+    """Return a rank as tables print it."""
+    return UNDEFINED if rank is None else str(rank)
+
+
 def _labels(row: Standing) -> list[str]:
     """Return rank, detector (marked where it is trivial), and settings with the number of seeds."""
     overrides = [f"{k}={v}" for k, v in row.entry.overrides.items()]
     several = [f"{row.seeds} seeds"] if row.seeds > 1 else []
     settings = ", ".join([f"Δ={row.entry.horizon}", *overrides, *several])
-    return [row.printed(row.rank), row.entry.detector + row.marks, settings]
+    return [printed_rank(row.rank), row.entry.detector + row.marks, settings]
 
 
 def _percent(rate: float) -> str:

@@ -44,7 +44,7 @@ def test_committed_entries_have_their_committed_places_on_the_published_board(co
     published = read_published(BOARD / PUBLISHED).boards
 
     def places(ranks):
-        return {s.entry: (s.rank, s.alarm_rank, s.ties, s.below) for s in ranks.standings}
+        return {s.entry: (s.rank, s.alarm_rank, s.ties) for s in ranks.standings}
 
     for section in committed:
         for one in section.entries:

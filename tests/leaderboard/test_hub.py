@@ -44,7 +44,7 @@ def test_each_detector_has_results_in_both_formats(written):
             assert result["dataset"]["id"] == "lovelace/oodd-small"
             assert result["source"]["url"] == "https://example.org/trivial"
             assert entry.meta.split_digest[:12] in result["notes"]
-            assert "trust level reported" in result["notes"]
+            assert "reported by its author" in result["notes"]
         # Of 20 calibration episodes there are alarms at 10 %, and none at 5 %.
         assert "auc_matched" in [result["dataset"]["task_id"] for result in results]
         assert {result["dataset"]["task_id"] for result in results} <= set(METRICS)

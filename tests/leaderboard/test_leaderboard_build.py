@@ -13,7 +13,7 @@ from helpers_records import PAIRED, example, make_record
 from helpers_site import submitted as entry
 from oodd_leaderboard import build as leaderboard_build
 from oodd_leaderboard.build import cells, page
-from oodd_leaderboard.entry import read_entries, sections
+from oodd_leaderboard.entry import REPORTED, read_entries, sections
 from oodd_leaderboard.published import PUBLISHED
 
 from oodd_eval.cli.main import main
@@ -96,7 +96,7 @@ def entries():
     return [
         entry("reference", others, caption="Reduced: one network | all sensors.",
               citation="Danesh & Fern 2021", url="https://example.org/riqn"),
-        entry("trivial", trivial, trust="re-run"),
+        entry("trivial", trivial),
         entry("other-split", other_split),
     ]  # fmt: skip
 
@@ -193,33 +193,6 @@ def test_part_of_a_simpler_row_does_not_stand_for_a_whole_one(lacks):
     assert [(str(s.entry), s.rank) for s in ranks.standings if s.primary] == [("foo[h=10]", 1)]
 
 
-def test_rows_that_were_not_run_again_stand_below_those_that_were():
-    """They keep the rank they would have, and nothing of the others changes through them."""
-    best = [dataclasses.replace(r, detector="claimed", horizon=1)
-            for r in board() if r.detector == "riqn" and r.horizon == 1]  # fmt: skip
-    official = [r for r in board() if r.detector != "rf"]
-    alone = sections([entry("official", official, trust="re-run")])[0].ranks
-    assert not any(s.below for s in alone.standings)
-    found = sections([entry("official", official, trust="re-run"), entry("stranger", best)])[0]
-    *above, last = found.ranks.standings
-    assert (str(last.entry), last.below, last.primary, last.rank) == ("claimed", True, True, 1)
-    assert above == alone.standings
-    rows = tables.ranking(found.ranks, found.trust).rows
-    assert [rows[-1][i] for i in (0, 1, 3, 6)] == ["(1)", UNDEFINED, "claimed (= riqn)", "reported"]
-    assert any("run again on seeds of their own" in n for n in tables.ranking_notes(found.ranks))
-    # Re-scored is not run again; and where nothing was, all rows are ranked.
-    claims = [entry("official", official, trust="re-scored"), entry("stranger", best)]
-    assert not any(s.below for s in sections(claims)[0].ranks.standings)
-
-
-def test_a_claimed_row_is_not_primary_in_place_of_one_that_was_run_again():
-    ten = [r for r in board() if r.detector == "riqn" and r.horizon == 10]
-    one = [r for r in board() if r.detector == "riqn" and r.horizon == 1]
-    ranks = sections([entry("official", ten, trust="re-run"), entry("stranger", one)])[0].ranks
-    standings = [(s.entry.horizon, s.primary, s.below) for s in ranks.standings]
-    assert standings == [(10, True, False), (1, False, True)]
-
-
 def test_a_page_has_every_table_of_every_board_and_the_entries():
     text = page(sections(entries()), site="site/index.html")
     first, second = text.split("\n## Split mini")[1:]
@@ -228,29 +201,17 @@ def test_a_page_has_every_table_of_every_board_and_the_entries():
     assert "(#split-mini-protocol-1), digest abababababab: 5 rows" in text
     assert "(#split-mini-protocol-1-1), digest cdcdcdcdcdcd: 2 rows" in text
     ranking = first.partition("### Ranking")[2].partition("Rank is")[0]
-    (line,) = [x for x in ranking.splitlines() if re.match(r"\| \(1\).* riqn +\| Δ=1 ", x)]
+    (line,) = [x for x in ranking.splitlines() if re.match(r"\| 1 .* riqn +\| Δ=1 ", x)]
     terms = [r.per_trajectory["auc_matched"][0] for r in board() if r.setting == Setting("riqn")]
     assert f"| {100 * np.mean(terms):.1f} " in line
     assert all(f"### {e.meta.id}: An entry" in text for e in entries())
-
-
-@pytest.mark.parametrize(
-    ("places", "where"), [(["hopper"], " in Hopper alone"), (["ant", "hopper"], ""), ([], "")]
-)
-def test_a_board_says_who_ran_what(places, where):
-    reference, trivial, other = entries()
-    grant = dataclasses.replace(trivial.grant, environments=places)
-    trivial = dataclasses.replace(trivial, grant=grant)
-    of_boards = sections([reference, trivial, other])
-    first, second = page(of_boards).split("\n## Split mini")[1:]
-    ran = f"Run by Somebody (4 detectors). Re-run by us{where}: clock, persistence."
-    assert f"\n{ran} Nobody has run or scored the others again.\n" in first
-    assert "\nRun by Somebody (2 detectors). Nobody has run or scored them again.\n" in second
+    assert f"\n{REPORTED} Run by Somebody (4 detectors).\n" in first
+    assert f"\n{REPORTED} Run by Somebody (2 detectors).\n" in second
 
 
 def test_tables_for_programs_have_the_figures_of_the_ranking():
     section = sections(entries())[0]
-    lines = lines_of(ranking_csv(section.ranks, section.trust))
+    lines = lines_of(ranking_csv(section.ranks))
     assert [line["detector"] for line in lines] == [
         s.entry.detector for s in section.ranks.standings
     ]
@@ -529,10 +490,8 @@ def test_nothing_depends_on_the_order_of_entries_or_records():
     ]
     one, other = sections(entries()), sections(turned)
     assert page(one) == page(other)
-    by_detector = {row.detector: level for row, level in one[0].trust.items()}
-    assert (by_detector["clock"], by_detector["riqn"]) == ("re-run", "reported")
     for a, b in zip(one, other, strict=True):
-        assert ranking_csv(a.ranks, a.trust) == ranking_csv(b.ranks, b.trust)
+        assert ranking_csv(a.ranks) == ranking_csv(b.ranks)
 
 
 def test_two_rows_with_the_same_name_are_refused():
@@ -721,58 +680,7 @@ def test_a_mean_is_within_its_interval_where_a_cell_is_undefined_for_one_seed():
     assert found.compare(first, second, "delay") == (16.25, 16.25, 2)
 
 
-# Rows with another's scores, and with other training data
-
-
-def renamed(name, *, of="riqn", **fields):
-    return [dataclasses.replace(r, detector=name, **fields)
-            for r in board() if r.detector == of and r.horizon == 1]  # fmt: skip
-
-
-def test_a_row_with_the_scores_of_another_is_folded_into_it():
-    """It takes its rank, stands behind it, and changes nothing of the others."""
-    before = ranked(board())
-    after = ranked([*board(), *renamed("riqn-ms")])
-    (clone,) = (s for s in after.standings if s.clone_of)
-    original = next(s for s in after.standings if s.entry == clone.clone_of)
-    assert (str(clone.entry), str(clone.clone_of)) == ("riqn-ms", "riqn")
-    assert clone.marks == " (= riqn)"
-    for field in ("rank", "alarm_rank", "ties", "wins"):
-        assert getattr(clone, field) == getattr(original, field)
-    assert [s for s in after.standings if s is not clone] == before.standings
-    assert after.ranking.comparisons == before.ranking.comparisons
-    assert list(after.ranking.ranks)[1:3] == ["riqn", "riqn-ms"]
-    assert any("has that row's scores" in note for note in tables.ranking_notes(after))
-
-
-def test_the_original_was_run_again_is_of_the_package_and_comes_first_by_name():
-    def folded(records, **options):
-        standings = ranked(records, **options).standings
-        return {str(s.entry): str(s.clone_of) for s in standings if s.clone_of}
-
-    early, foreign = renamed("aaa"), renamed("aaa", plugin="thief:x")
-    assert folded([*board(), *early]) == {"riqn": "aaa"}
-    assert folded([*board(), *foreign]) == {"aaa": "riqn"}
-    settings = {r.setting for r in board()}
-    assert folded([*board(), *early], rerun=settings) == {"aaa": "riqn"}
-    simple = renamed("zzz")
-    loaded = [dataclasses.replace(r, overrides={"trees": 1}) for r in renamed("aaa")]
-    assert folded([*(r for r in board() if r.detector != "riqn"), *simple, *loaded]) == {
-        "aaa[trees=1]": "zzz"
-    }
-
-
-@pytest.mark.parametrize("metric", ["auc_matched", "delay_censored_at_5pct"])
-def test_one_other_number_makes_another_row(metric):
-    other = renamed("other")
-    other[-1].per_trajectory[metric][0, 0] += 1e-3
-    assert not any(s.clone_of for s in ranked([*board(), *other]).standings)
-
-
-def test_rows_that_tell_nothing_apart_are_not_those_of_one_another():
-    """Clock and comb have matched AUC one half everywhere, and are two detectors."""
-    ranks = ranked([*board(), *renamed("comb", of="clock")])
-    assert not any(s.clone_of for s in ranks.standings)
+# Rows with other training data
 
 
 @pytest.mark.parametrize(

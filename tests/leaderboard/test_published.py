@@ -11,7 +11,7 @@ from helpers_records import make_record
 from helpers_site import submitted
 from oodd_leaderboard import published
 from oodd_leaderboard.commands import board as board_command
-from oodd_leaderboard.entry import SuiteSection, sections
+from oodd_leaderboard.entry import REPORTED, SuiteSection, sections
 from oodd_leaderboard.published import (
     board_of,
     neighbours,
@@ -58,15 +58,11 @@ def row(detector, mean, *, seeds=(0, 1, 2), places=PLACES, **more):
     return made
 
 
-def entry(name, records, *, trust="re-run", **meta):
-    return submitted(name, records, trust=trust, **meta)
-
-
 def entries():
     rows = [r for name, mean in MEANS.items() for r in row(name, mean)]
     return [
-        entry("first", [*rows, *row("fair", 0.85, horizon=5)], primary=["fair[h=5]"]),
-        entry("claim", row("claimed", 0.95), trust="reported"),
+        submitted("first", [*rows, *row("fair", 0.85, horizon=5)], primary=["fair[h=5]"]),
+        submitted("second", row("other", 0.5)),
     ]
 
 
@@ -92,9 +88,7 @@ def shipped(file, monkeypatch):
 
 
 def places(ranks):
-    return {
-        str(s.entry): (s.rank, s.alarm_rank, s.ties, s.primary, s.below) for s in ranks.standings
-    }
+    return {str(s.entry): (s.rank, s.alarm_rank, s.ties, s.primary) for s in ranks.standings}
 
 
 def run_of(records, directory):
@@ -130,10 +124,8 @@ def test_show_prints_further_suites_unless_one_board_is_asked_for(
 def test_the_rankings_of_the_file_are_those_of_the_board(board, shipped):
     assert places(shipped.ranks()) == places(board.ranks)
     assert places(board.ranks)["fair[h=5]"][3]  # as its entry declares
-    assert places(board.ranks)["claimed"] == (1, 1, "", True, True)
-    assert shipped.trust == board.trust
     assert {str(r): e for r, e in shipped.entries.items()} == {
-        "claimed": "claim", "fair": "first", "fair[h=5]": "first", "good": "first", "poor": "first"
+        "other": "second", "fair": "first", "fair[h=5]": "first", "good": "first", "poor": "first"
     }  # fmt: skip
 
 
@@ -154,7 +146,7 @@ def test_an_installation_without_a_board_says_so(monkeypatch, tmp_path):
 # Placing
 
 
-@pytest.mark.parametrize("name", ["first", "claim"])
+@pytest.mark.parametrize("name", ["first", "second"])
 def test_an_entrys_own_records_have_the_places_of_the_board(name, board, shipped):
     (own,) = [e for e in entries() if e.meta.id == name]
     placed = placement(own.records, shipped, own.meta.primary)
@@ -163,10 +155,10 @@ def test_an_entrys_own_records_have_the_places_of_the_board(name, board, shipped
     assert not placed.lacking
 
 
-def test_a_new_row_has_the_rank_that_the_board_would_give_it_when_it_was_run_again(shipped):
+def test_a_new_row_has_the_rank_that_the_board_would_give_it(shipped):
     mine = row("mine", 0.7)
     placed = placement(mine, shipped)
-    (would,) = sections([*entries(), entry("mine", mine)])
+    (would,) = sections([*entries(), submitted("mine", mine)])
     assert places(placed.ranks) == places(would.ranks)
     assert places(placed.ranks)["mine"][:2] == (3, 3)
     assert not placed.published
@@ -242,11 +234,9 @@ def test_rankings_mark_own_rows_and_have_an_order_of_their_own(shipped):
         for r in row("slow", 0.9)
     ]  # fmt: skip
     placed = placement(slow, shipped)
-    first, second = rankings(placed.ranks, shipped.trust | {Setting("slow"): "yours"}, placed.rows)
+    first, second = rankings(placed.ranks, placed.rows)
     assert {line[1]: line[0] for line in first.rows}["> slow"] == "1 a"
-    assert [line[3] for line in first.rows if line[1] == "> slow"] == ["yours"]
-    assert second.rows[-2][:2] == ["4", "> slow"]
-    assert second.rows[-1][1] == "claimed"  # below those that were run again
+    assert second.rows[-1][:2] == ["5", "> slow"]
 
 
 def test_show_prints_both_rankings(shipped, capsys):
@@ -254,7 +244,8 @@ def test_show_prints_both_rankings(shipped, capsys):
     printed = capsys.readouterr().out
     first, second = printed.split("Ranking by guaranteed alarms at 5 %")
     assert "Ranking by separability" in first
-    assert "Entry claim: claimed." in second
+    assert "Entry second: other." in second
+    assert printed.count(REPORTED) == 1
     assert main(["leaderboard", "show", "--csv"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("rank,ties,alarm_rank,state,detector,")
@@ -288,10 +279,7 @@ def test_a_place_over_few_cells_says_how_many_rows_share_it(shipped):
     assert first.startswith("mine, over 1 of 4 cells: rank 2 (shared by 3 rows) by separability, ")
     clock = row("clock", 0.85, plugin="oodd-eval:trivial")
     beside = dataclasses.replace(
-        shipped,
-        records=[*shipped.records, *clock],
-        trust=shipped.trust | {Setting("clock"): "re-run"},
-        primary=shipped.primary | {Setting("clock")},
+        shipped, records=[*shipped.records, *clock], primary=shipped.primary | {Setting("clock")}
     )
     (first, *_) = board_command._sentences(placement(mine, beside), {})
     assert "rank 2 (shared by 4 rows, 1 of them trivial: it says nothing) by separability" in first
@@ -299,18 +287,12 @@ def test_a_place_over_few_cells_says_how_many_rows_share_it(shipped):
     assert whole.startswith("mine: rank 2 by separability, rank ")
 
 
-def test_notes_of_a_place_speak_of_printed_rows_and_stand_once(
-    shipped, tmp_path, capsys, monkeypatch
-):
-    directory = run_of([*row("mine", 0.7), *row("other", 0.65)], tmp_path / "out")
+def test_notes_of_a_place_stand_once(shipped, tmp_path, capsys):
+    directory = run_of([*row("mine", 0.7), *row("another", 0.65)], tmp_path / "out")
     assert main(["leaderboard", "place", directory]) == 0
     text = " ".join(capsys.readouterr().out.split())
     assert text.count("Paired differences over the same test episodes") == 1
     assert "Rank is 1 + the number of primary rows that are significantly better" in text
-    assert "others stand below, in brackets the rank" in text
-    monkeypatch.setattr(board_command, "NEARBY", 0)
-    assert main(["leaderboard", "place", directory]) == 0
-    assert "others stand below" not in " ".join(capsys.readouterr().out.split())
 
 
 def test_a_tie_whose_interval_leaves_out_zero_has_its_reason(shipped):

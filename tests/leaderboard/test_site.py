@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from oodd_leaderboard import site
 from oodd_leaderboard.curve_file import read_curves
-from oodd_leaderboard.entry import read_entries, sections
+from oodd_leaderboard.entry import REPORTED, read_entries, sections
 from oodd_leaderboard.site.data import (
     WITH_INTERVALS,
     gridded,
@@ -170,7 +170,6 @@ def test_rows_have_the_ranks_of_the_board(entries, page):
         assert (found["rank"], found["ties"], found["state"]) == (
             standing.rank, standing.ties, standing.state,
         )  # fmt: skip
-        assert found["trust"] == section.trust[standing.entry]
     assert row(data, "mine[window=3]")["rank"] is None
     assert row(data, "mine[window=3]")["state"] == "timeout in 2 of 8 cells"
 
@@ -341,7 +340,7 @@ def test_undefined_values_are_null_and_a_board_on_which_everything_failed_has_it
     assert set(usual) == set(data["metrics"])
 
 
-def test_an_entry_says_who_granted_its_trust_and_its_source(tmp_path):
+def test_an_entry_says_its_source(tmp_path):
     record = helpers_site.make_record()
     named = {"distribution": "oodd-eval", "plugin": "riqn", "version": "1"}
     plugins = [
@@ -349,13 +348,10 @@ def test_an_entry_says_who_granted_its_trust_and_its_source(tmp_path):
         named | {"source_digest": "12" * 32},
     ]
     root = tmp_path / "results"
-    helpers_site.write_entry(root, "one", [record], trust="re-run", plugins=plugins)
+    helpers_site.write_entry(root, "one", [record], plugins=plugins)
     files = site.files(sections(read_entries(root)))
-    assert row(embedded(files[site.PAGE]), "riqn")["trust"] == "re-run"
+    assert REPORTED in files[site.PAGE]
     found = part(files, "riqn")
-    assert found["entry"]["grant"] == {
-        "by": "C. Hecker", "day": "2026-11-22", "how": "fresh seeds",
-    }  # fmt: skip
     assert found["entry"]["source_digest"] == "12" * 32
 
 

@@ -34,7 +34,7 @@ def verify(submissions, *paths):
 
 
 def test_what_is_submitted_is_valid_and_complete(submissions, tmp_path, capsys):
-    assert submit(submissions, tmp_path, "--submitter", "A. Tester", "--scores") == 0
+    assert submit(submissions, tmp_path, "--submitter", "A. Tester") == 0
     out = capsys.readouterr().out
     assert "persistence-random-small: valid, 16 cells" in out
     assert f"git add {tmp_path / 'persistence-random-small'}" in out
@@ -46,7 +46,6 @@ def test_what_is_submitted_is_valid_and_complete(submissions, tmp_path, capsys):
     assert [p["plugin"] for p in entry.meta.plugins] == ["trivial"]
     assert len(entry.records) == 16
     assert entry.curves is not None
-    assert len(list((entry.path / "scores").iterdir())) == 2
 
 
 def test_the_commands_of_an_entry_give_its_cells():
@@ -127,7 +126,7 @@ def test_a_failed_detector_can_be_submitted_with_its_reason(submissions, tmp_pat
     (home / "records.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     code = cli.main(
         ["leaderboard", "submit", str(home), "--results", str(tmp_path / "entries"),
-         "--split", str(submissions.split), "--scores"]
+         "--split", str(submissions.split)]
     )  # fmt: skip
     assert code == 0
     (entry,) = read_entries(tmp_path / "entries")
@@ -196,5 +195,4 @@ print("LOADED", sorted(loaded & known), code)
         env=os.environ | {"PYTHONPATH": path},
     )  # fmt: skip
     assert done.stdout.splitlines()[-1] == "LOADED [] 0", done.stdout + done.stderr
-    assert "established here: re-scored" in done.stdout
     assert not marker.exists()

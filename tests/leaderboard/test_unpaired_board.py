@@ -84,23 +84,21 @@ def results(split, directory):
 
 @pytest.fixture(scope="module")
 def entries(split, directory, tmp_path_factory):
-    """A directory of entries with one, of all rows with scores and curves."""
+    """A directory of entries with one, of all rows with curves."""
     root = tmp_path_factory.mktemp("board") / "results"
     statement = Statement(id="logs", submitter="A. Tester")
-    submission = submit(directory, root, statement, scores=True, split=split.path)
+    submission = submit(directory, root, statement, split=split.path)
     assert submission.verdict.ok, submission.verdict.findings.problems
     return root
 
 
 @pytest.fixture(scope="module")
 def small(split, tmp_path_factory):
-    """An entry with scores of two rows, to tamper with."""
+    """An entry of two rows, to tamper with."""
     home = tmp_path_factory.mktemp("small")
     evaluate(("clock", "range"), split, output=home / "results")
     statement = Statement(id="small", submitter="A. Tester")
-    written = submit(
-        home / "results", home / "entries", statement, scores=True, split=split.path, curves="none"
-    )
+    written = submit(home / "results", home / "entries", statement, split=split.path, curves="none")
     assert written.verdict.ok
     return written.path
 
@@ -300,23 +298,6 @@ def test_an_environment_counts_with_all_its_anomalies(small, split, tmp_path):
     draft.records.remove(left_out)
     verdict = draft.verdict(split.path)
     assert any("press lacks leak" in p.text for p in verdict.findings.problems)
-
-
-def test_scores_of_other_parts_are_refused(small, split, tmp_path):
-    draft = Draft(small, tmp_path)
-    arm = next(r for r in draft.records if r["environment"] == "arm")
-    press = next(r for r in draft.records if r["environment"] == "press")
-    source, target = (draft.file(f"scores/{r['scores']}.h5") for r in (press, arm))
-    target.write_bytes(source.read_bytes())
-    verdict = draft.verdict(split.path)
-    texts = [problem.text for problem in verdict.findings.problems]
-    assert any("lacks the group test/slip" in text for text in texts)
-
-
-def test_logs_are_not_run_again(entries, tmp_path, capsys):
-    command = ["leaderboard", "rerun", str(entries / "logs"), "--output", str(tmp_path / "again")]
-    assert main(command) == 4
-    assert "cannot be recorded again" in capsys.readouterr().err
 
 
 # Pages

@@ -25,7 +25,7 @@ from oodd_eval.results.record import Record
 from oodd_eval.results.render.data import ranking_csv
 from oodd_eval.results.render.text import markdown_section
 from oodd_eval.results.standings import Standing
-from oodd_leaderboard.entry import ENTRY, read_entry
+from oodd_leaderboard.entry import ENTRY, REPORTED, read_entry
 from oodd_leaderboard.published import (
     MARK,
     Placement,
@@ -61,14 +61,12 @@ def show(options: Options) -> int:
     output = _Output(options)
     for board in chosen:
         ranks = board.ranks()
-        notes = [*tables.ranking_notes(ranks, whole=False), *_of_entries(board)]
+        notes = [REPORTED, *tables.ranking_notes(ranks, whole=False), *_of_entries(board)]
         output.print(
             Section(
-                f"Leaderboard, {board}",
-                tables=rankings(ranks, board.trust),
-                notes=[] if output.quiet else notes,
+                f"Leaderboard, {board}", tables=rankings(ranks), notes=[] if output.quiet else notes
             ),
-            ranking_csv(ranks, board.trust) if output.csv else "",
+            ranking_csv(ranks) if output.csv else "",
         )
     if options.split or output.csv or output.quiet:
         return 0
@@ -98,10 +96,9 @@ def place_run(options: Options) -> int:
     for run, board in zip(runs, compared_with, strict=True):
         placed = placement(run.records, board, primary)
         new = placed.rows - placed.published
-        trust = board.trust | dict.fromkeys(new, "yours")
         of_ranks, notes = [], []
         if not output.quiet:
-            of_ranks = rankings(placed.ranks, trust, placed.rows)
+            of_ranks = rankings(placed.ranks, placed.rows)
             if not options.everything:
                 of_ranks = list(map(_nearby, of_ranks))
             names = {line[1] for table in of_ranks for line in table.rows}
@@ -119,7 +116,7 @@ def place_run(options: Options) -> int:
                 tables=of_ranks,
                 notes=notes,
             ),
-            ranking_csv(placed.ranks, trust) if output.csv and not output.quiet else "",
+            ranking_csv(placed.ranks) if output.csv and not output.quiet else "",
         )
     return 0
 
@@ -180,11 +177,6 @@ def _sentences(placed: Placement, entries: Mapping[Setting, str]) -> list[str]:
             f"have, of {len(placed.expected)}, and so not the board's. With few episodes hardly "
             "any difference is significant. Run the other cells into the same directory."
         )
-    if placed.rows - placed.published:
-        lines.append(
-            "New rows are ranked as if a maintainer had run them again. Until then an entry stands "
-            "below the rows that were."
-        )
     return lines
 
 
@@ -195,10 +187,10 @@ def _rank(rank: int | None) -> str:
 def _shared(standing: Standing, standings: Sequence[Standing], kind: str) -> str:
     """Return in brackets how many rows share a rank, and that it says nothing among trivial ones.
 
-    Rows below the ranking do not count, nor trivial ones beside a row that is trivial itself.
+    Trivial rows do not count beside a row that is trivial itself.
     """
     rank = getattr(standing, kind)
-    same = [s for s in standings if rank and getattr(s, kind) == rank and not s.below]
+    same = [s for s in standings if rank and getattr(s, kind) == rank]
     if len(same) < 2:
         return ""
     trivial = sum(s.trivial for s in same) * (not standing.trivial)

@@ -19,8 +19,8 @@ from oodd_leaderboard import hub
 from oodd_leaderboard import submit as submission
 from oodd_leaderboard.build import STALE, differences, stale
 from oodd_leaderboard.build import build as build_board
-from oodd_leaderboard.entry import GRANTS, read_entries, read_entry, suite_sections
-from oodd_leaderboard.verify import EntryVerdict, grant
+from oodd_leaderboard.entry import read_entries, read_entry, suite_sections
+from oodd_leaderboard.verify import EntryVerdict
 from oodd_leaderboard.verify import verify as check
 from oodd_leaderboard.verify import verify_changed as check_changed
 
@@ -97,7 +97,6 @@ def part_shown(*, quiet: bool) -> Iterator[Callable[[str], object]]:
     help="ranked rows, such as 'riqn[updates=9000]' (default: default parameters, least horizon)",
 )
 @click.option("--caption", help="a note above the tables, such as a reduced setting")
-@click.option("--scores", is_flag=True, help="include every score, so that others can recompute")
 @_split_option
 @click.option(
     "--curves",
@@ -120,7 +119,7 @@ def submit(options: Options) -> int:
     texts = {name: getattr(options, name) or "" for name in names}
     texts["citation"] = " ".join(texts["citation"].split())
     statement = submission.Statement(**texts, primary=options.primary)
-    chosen = ("detectors", "complete", "scores", "curves", "split")
+    chosen = ("detectors", "complete", "curves", "split")
     how = {name: getattr(options, name) for name in chosen} | {"cells": options.expression}
     submitted = submission.submit(options.directory, options.results, statement, **how)
     console, path = make_console(), submitted.path
@@ -133,7 +132,7 @@ def submit(options: Options) -> int:
     if options.verbosity >= 0:
         size = sum(p.stat().st_size for p in path.rglob("*") if p.is_file())
         if size > submission.LARGE:
-            advice = "leave the scores or some curves out (--curves), or submit fewer rows"
+            advice = "leave some curves out (--curves), or submit fewer rows"
             console.print(f"  note: so large an entry is a burden to the repository: {advice}")
         console.print(
             f"\nwritten to {path}, {size / 1e6:.2g} MB; next:\n"
@@ -158,7 +157,6 @@ def submit(options: Options) -> int:
     help="check a pull request: entries changed since the branch, nothing else, and the board",
 )
 @_split_option
-@click.option("--grant", help=f"write the trust level that was reached into {GRANTS}, in this name")
 def verify(options: Options) -> int:
     """Check entries as data, running none of their code.
 
@@ -167,13 +165,9 @@ def verify(options: Options) -> int:
     console = make_console()
     paths = options.paths or (Path(RESULTS),)
     if options.changed_against:
-        if options.grant or options.split or len(paths) > 1:
-            raise UsageError(
-                "--changed-against is for one directory of entries, without --split or --grant"
-            )
+        if options.split or len(paths) > 1:
+            raise UsageError("--changed-against is for one directory of entries, without --split")
         return verify_pull_request(console, paths[0], options)
-    if options.grant and len(paths) > 1:
-        raise UsageError("--grant is for one entry: name a single PATH")
     verdicts = []
     for path in paths:
         for verdict in check(path, split=options.split):
@@ -181,10 +175,6 @@ def verify(options: Options) -> int:
             report(console, verdict, options.verbosity)
     if not verdicts:
         return say(f"no entries in {', '.join(map(str, paths))}", 5)
-    if options.grant:
-        if len(verdicts) > 1:
-            raise UsageError("--grant is for one entry: name it, not the directory of entries")
-        return write_grant(console, paths[0], verdicts[0], options.grant)
     refused = sum(not verdict.ok for verdict in verdicts)
     if len(verdicts) > 1:
         console.print(f"{len(verdicts) - refused} valid, {refused} refused")
@@ -219,22 +209,12 @@ def verify_pull_request(console: Console, results: Path, options: Options) -> in
     return 0
 
 
-def write_grant(console: Console, path: Path, verdict: EntryVerdict, by: str) -> int:
-    """Grant an entry the level of trust that was established, and say where it is written."""
-    granted = grant(path, verdict, by)
-    grants = path.absolute().parents[1] / GRANTS
-    console.print(f"{verdict.name}: trust {granted.trust} is written to {grants}")
-    return 0
-
-
 def report(console: Console, verdict: EntryVerdict, verbosity: int) -> None:
     """Print what was found for one entry, every problem with its entry, position and field."""
     findings, entry = verdict.findings, verdict.entry
     if verdict.ok and entry is not None:
         cells = f"{counted(len(verdict.records), 'cell(s)')} of {', '.join(entry.detectors)}"
-        console.print(f"{verdict.name}: valid, {cells} on {entry.split}, trust {verdict.trust}")
-        if verdict.rerun is not None or verdict.rescored:
-            console.print(f"  trust level established here: {verdict.reached}")
+        console.print(f"{verdict.name}: valid, {cells} on {entry.split}")
     else:
         console.print(f"{verdict.name}: refused, {counted(findings.count, 'problem(s)')}")
     alike: dict[object, list[str]] = {}  # one line of those that many records have
@@ -248,8 +228,6 @@ def report(console: Console, verdict: EntryVerdict, verbosity: int) -> None:
     ]
     if (left := findings.count - sum(map(len, groups))) > 0:
         lines.append(f"and {left} more")
-    if verdict.rerun is not None:
-        lines.append(f"re-run: {verdict.rerun.how}")
     lines += [f"note: {note}" for note in (findings.notes if verbosity >= 0 else ())]
     for line in lines:
         console.print(f"  {line}")

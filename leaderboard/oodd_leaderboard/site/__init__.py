@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from oodd_eval._version import __version__
-from oodd_leaderboard.entry import LeaderboardSection, SuiteSection
+from oodd_leaderboard.entry import REPORTED, LeaderboardSection, SuiteSection
 from oodd_leaderboard.site.data import Json, site_data
 
 PAGE: Final = "index.html"
@@ -63,6 +63,7 @@ def index(data: Json) -> str:
     style = _static("style.css")
     parts = {
         "version": __version__,
+        "reported": REPORTED,
         "style": style,
         "style-hash": _digest(style),
         "script": script,

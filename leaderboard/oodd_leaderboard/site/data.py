@@ -231,15 +231,11 @@ def _row(
         "horizon": row.horizon,
         "overrides": row.overrides,
         "seeds": sorted({r.seed for r in records}),
-        **_fields(
-            standing, "trivial", "primary", "below", "inputs", "rank", "alarm_rank", "ties", "state"
-        ),
-        "clone_of": str(standing.clone_of or ""),
+        **_fields(standing, "trivial", "primary", "inputs", "rank", "alarm_rank", "ties", "state"),
         "training": standing.training,
         "wins": _short(standing.wins),
         "lead": standing.lead,
         "cost": {n: _short(v) for n, v in standing.cost._asdict().items()},
-        "trust": section.trust[row],
         **_fields(source.meta, "submitter", "caption"),
         "missing": [i for i, cell in enumerate(chosen.get("all|all", [])) if cell not in have],
         "failed": [
@@ -331,12 +327,9 @@ def _ranking_intervals(
 
 def _entry(entry: SubmittedEntry, plugin: str) -> Json:
     """Return who an entry is from, and the digest of the plug-in's source that it names."""
-    meta, grant = entry.meta, entry.grant
-    digests = {f"{p['distribution']}:{p['plugin']}": p["source_digest"] for p in meta.plugins[::-1]}
-    return _fields(meta, *ENTRY_FIELDS) | {
-        "source_digest": digests.get(plugin, ""),
-        "grant": grant and _fields(grant, "by", "day", "how"),
-    }
+    of_entry = entry.meta.plugins[::-1]
+    digests = {f"{p['distribution']}:{p['plugin']}": p["source_digest"] for p in of_entry}
+    return _fields(entry.meta, *ENTRY_FIELDS) | {"source_digest": digests.get(plugin, "")}
 
 
 def _cell(record: Record, names: Sequence[str], with_ends: Sequence[str]) -> Json:

@@ -1,42 +1,34 @@
 """Verify entries strictly as data: nothing of them is imported, executed or followed.
 
 An entry is checked in an order in which every step only meets what the steps before have found
-sound: files, ``entry.json``, digests, the fields of each record, the metrics of each record, the
-records among each other, curves and scores, and last the scores against the split, where it is at
-hand. Whether numbers that agree are those of the detector is not asked here: re-runs do (`rerun`).
+sound: files, ``entry.json``, digests, the fields of each record, the records among each other,
+curves. Whether the numbers are those of the detector is not asked: its author reports them.
 """
 
 import os
 import stat
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
 from oodd_eval.data.facts import SPLITS
 from oodd_eval.data.files import UNFINISHED, forms
 from oodd_eval.data.split import Split, load_split, published_digests
-from oodd_eval.errors import ResultsError, SplitError, UnknownNameError, UsageError
+from oodd_eval.errors import ResultsError, SplitError, UnknownNameError
+from oodd_eval.metrics.ranking import Position
 from oodd_eval.results.board import defined_cells
 from oodd_eval.results.directory import RECORDS
 from oodd_leaderboard.curve_file import check_curves
 from oodd_leaderboard.entry import (
     CURVES,
     ENTRY,
-    GRANTS,
-    TRUST,
     EntryInfo,
-    Grant,
     SubmittedEntry,
-    Trust,
-    digest_of,
     read_entry,
-    read_grants,
     recorded_plugins,
     recorded_versions,
     row_of,
-    write_grants,
 )
 from oodd_leaderboard.verify.files import (
     Findings,
@@ -47,16 +39,8 @@ from oodd_leaderboard.verify.files import (
     read_files,
     short,
 )
-from oodd_leaderboard.verify.formats import GRANTED_BY, complaint, read_info, read_records
-from oodd_leaderboard.verify.recompute import (
-    Records,
-    check_against_split,
-    check_record,
-    check_rescored,
-    check_scores,
-    check_together,
-)
-from oodd_leaderboard.verify.rerun import Rerun
+from oodd_leaderboard.verify.formats import read_info, read_records
+from oodd_leaderboard.verify.records import Records, check_record, check_together
 
 ROOT_FILES: Final = frozenset({"README.md", ".gitkeep"})  # files that may lie beside the entries
 
@@ -65,49 +49,19 @@ ROOT_FILES: Final = frozenset({"README.md", ".gitkeep"})  # files that may lie b
 class EntryVerdict:
     """The result of verifying one entry.
 
-    `entry` is None when ``entry.json`` is not sound, `digest` is that of its bytes; `records` are
-    the sound ones, by where they stand; `rescored` says that every metric was recomputed from the
-    scores and agrees; `grant` is what maintainers have granted to just this entry, `rerun` how it
-    compares with a run of its rows on fresh seeds.
+    `entry` is None when ``entry.json`` is not sound; `records` are the sound ones, by where they
+    stand.
     """
 
     name: str
     findings: Findings
     records: Records
     entry: EntryInfo | None = None
-    rescored: bool = False
-    digest: str = ""
-    grant: Grant | None = None
-    rerun: Rerun | None = None
 
     @property
     def ok(self) -> bool:
         """True if no problem was found."""
         return not self.findings.count
-
-    @property
-    def trust(self) -> Trust:
-        """The level of trust that was granted."""
-        return self.grant.trust if self.grant else "reported"
-
-    @property
-    def reached(self) -> Trust | None:
-        """The level of trust that was established here; None for an entry that is refused."""
-        if not self.ok:
-            return None
-        if self.rerun is not None and self.rerun.complete:
-            return "re-run"
-        return "re-scored" if self.rescored else "reported"
-
-    @property
-    def gains(self) -> bool:
-        """True where a higher level was established, or a re-run in more environments."""
-        if self.reached is None:
-            return False
-        places = self.rerun.environments if self.rerun and self.reached == "re-run" else ()
-        held = self.grant.environments if self.grant else ()
-        reached = TRUST.index(self.reached), len(places)
-        return reached > (TRUST.index(self.trust), len(held))
 
 
 def verify_entry(
@@ -115,7 +69,8 @@ def verify_entry(
 ) -> EntryVerdict:
     """Check one entry, which is going to have another name if one is given.
 
-    `split` names its split where that is not at its usual place.
+    `split` names its split where that is not at its usual place. Only a split that is not published
+    needs to be there: it says which cells a whole row has.
     """
     name = name or Path(os.path.abspath(directory)).name  # noqa: PTH100  a link is not followed
     findings = Findings()
@@ -133,32 +88,13 @@ def verify_entry(
     if entry is None or not records:
         return EntryVerdict(name, findings, records, entry)
     _check_statements(entry, records, findings)
-    opened, note = find_split(entry.split, entry.split_digest, split)
-    cells = (
-        {(e, str(c)) for e in opened.environments for c in opened.conditions(e)} if opened else ()
-    )
-    cells = defined_cells(entry.split) if entry.split in SPLITS else cells
+    cells, note = _cells(entry, split)
+    findings.notes += [f"{note}: its cells are taken to be those of these records"] if note else []
     check_together(entry, records, cells, findings)
     name_of_curves, text = find_text(contents, CURVES, findings)
     with findings.reading(name_of_curves):
         _ = text and check_curves(parse_json(text), name_of_curves)
-    scored = check_scores(directory, contents, records, findings)
-    rescored = False
-    if opened is None:
-        findings.notes.append(f"{note}: compared with no trajectory, nothing recomputed")
-    else:
-        of_split = {w: r for w, r in records.items() if r.split_digest == opened.digest}
-        check_against_split(of_split, opened, findings)
-        complete = all(where in scored for where, r in records.items() if r.ok)
-        if scored := {w: r for w, r in scored.items() if w in of_split}:
-            rescored = check_rescored(scored, directory, opened, findings) and complete
-    digest = digest_of(contents[ENTRY])
-    grant = read_grants(directory.absolute().parent).get(name)
-    held = grant if grant and grant.entry == digest else None
-    rescored = rescored and not findings.count
-    verdict = EntryVerdict(name, findings, records, entry, rescored, digest, held)
-    findings.notes.extend(_notes_on_trust(verdict))
-    return verdict
+    return EntryVerdict(name, findings, records, entry)
 
 
 def _guarded(directory: Path, split: str | Path | None) -> EntryVerdict:
@@ -213,6 +149,16 @@ def _check_statements(entry: EntryInfo, records: Records, findings: Findings) ->
         findings.expect(ENTRY, field, version, stated.get(package), why)
 
 
+def _cells(entry: EntryInfo, path: str | Path | None) -> tuple[Collection[Position], str]:
+    """Return the cells of an entry's split, or why they are not known."""
+    if entry.split in SPLITS:
+        return defined_cells(entry.split), ""
+    split, note = find_split(entry.split, entry.split_digest, path)
+    if split is None:
+        return (), note
+    return {(e, str(c)) for e in split.environments for c in split.conditions(e)}, ""
+
+
 def find_split(name: str, digest: str, path: str | Path | None) -> tuple[Split | None, str]:
     """Open a split, or say why it is not at hand; one that a `path` names has to be there."""
     try:
@@ -227,14 +173,6 @@ def find_split(name: str, digest: str, path: str | Path | None) -> tuple[Split |
     return None, f"split {split.name} here has {digests}"
 
 
-def _notes_on_trust(verdict: EntryVerdict) -> Iterator[str]:
-    """Say who granted the level of trust that an entry has, and which one was established here."""
-    if (held := verdict.grant) is not None:
-        yield f"{held.trust} was granted by {held.by} on {held.day}: {held.how}"
-    if verdict.gains:
-        yield f"qualifies for {verdict.reached!r} (--grant)"
-
-
 def verify(path: Path | str, *, split: str | Path | None = None) -> Iterator[EntryVerdict]:
     """Check an entry, or all entries of a directory and that no two of them clash.
 
@@ -247,21 +185,16 @@ def verify(path: Path | str, *, split: str | Path | None = None) -> Iterator[Ent
     if any(os.path.lexists(path / name) for name in (ENTRY, *forms(RECORDS))):
         yield verify_entry(path, split=split)
         return
-    stray, neighbours, digests = Findings(), Neighbours(), {}
+    stray, neighbours = Findings(), Neighbours()
     for child in sorted(path.iterdir()):
         if UNFINISHED.fullmatch(child.name):  # by a submission that goes on, or was killed
             continue
         if child.is_symlink() or child.is_dir():
             verdict = _guarded(child, split)
             neighbours.check(verdict)
-            digests[child.name] = verdict.digest
             yield verdict
         elif child.name not in ROOT_FILES:
             stray.refuse(plain(child.name), "", "is no entry: expected directories alone")
-    for name, grant in read_grants(path).items():
-        if digests.get(name) != grant.entry:
-            message = "is of an entry.json that is not here: verify the entry and grant it again"
-            stray.refuse(GRANTS, name, message)
     if stray.count:
         yield EntryVerdict(str(path), stray, {})
 
@@ -306,26 +239,3 @@ class Neighbours:
             owner, first = self._origins.setdefault(record.detector, (verdict.name, origin))
             why = f"as in entry {owner}: a name stands for one detector"
             verdict.findings.expect(where, "detector", f"from {first}", f"from {origin}", why)
-
-
-def grant(directory: Path, verdict: EntryVerdict, by: str) -> Grant:
-    """Grant an entry the level of trust that its verification by somebody established."""
-    if message := complaint(GRANTED_BY, by):
-        raise UsageError(f"--grant {message}")
-    level = verdict.reached
-    if level is None:
-        raise UsageError(f"--grant: {verdict.name} is refused, so nothing is granted")
-    if level == "reported" or not verdict.gains:
-        raise UsageError(
-            f"--grant: {verdict.name} has trust {verdict.trust!r}, and what was established here "
-            f"is {level!r}: more needs its scores (re-scored) or leaderboard rerun of all its rows "
-            "(in more environments than before)"
-        )
-    day = datetime.now(UTC).date().isoformat()
-    if (again := verdict.rerun) and level == "re-run":
-        new = Grant(verdict.digest, level, by, day, again.how, again.means, again.environments)
-    else:
-        new = Grant(verdict.digest, level, by, day, "every metric recomputed from its scores")
-    results = directory.absolute().parent
-    write_grants(results, read_grants(results) | {verdict.name: new})
-    return new

@@ -20,7 +20,7 @@ from oodd_eval.data.bounded import read_bytes
 from oodd_eval.data.files import MAX_BYTES, PACKED, decompress, forms
 from oodd_eval.errors import ResultsError
 from oodd_eval.results.directory import RECORDS
-from oodd_leaderboard.entry import CURVES, ENTRY, SCORES
+from oodd_leaderboard.entry import CURVES, ENTRY
 
 MB: Final = 10**6
 MOST_PLAIN: Final = {RECORDS: MAX_BYTES, CURVES: 16 * MB}  # decompressed sizes
@@ -28,15 +28,11 @@ MOST_PLAIN: Final = {RECORDS: MAX_BYTES, CURVES: 16 * MB}  # decompressed sizes
 MOST_BYTES: Final = (
     {ENTRY: MB // 4} | MOST_PLAIN | {name + end: 8 * MB for end in PACKED for name in MOST_PLAIN}
 )
-"""Largest sizes by name; those of score files are `MOST_SCORE_BYTES`."""
+"""Largest sizes by name."""
 
-MOST_SCORE_BYTES: Final = 64 * MB
-MOST_TOTAL_BYTES: Final = 128 * MB
 MOST_FILES: Final = 2000
 
 MOST_PROBLEMS: Final = 200  # problems of one entry that are kept; more are counted
-
-_SCORE_FILE: Final = re.compile(rf"{SCORES}/[a-z0-9][a-z0-9._-]{{0,159}}\.h5")
 
 _SHORT: Final = reprlib.Repr()
 _SHORT.maxstring = _SHORT.maxother = 60
@@ -108,19 +104,13 @@ class Findings:
 
 def read_files(entry: Path, findings: Findings) -> dict[str, bytes]:
     """Return the content of an entry's files by name; all else in the directory is refused."""
-    listed = _scan(entry, "", findings)
-    if SCORES in listed and stat.S_ISDIR(listed[SCORES].st_mode):
-        del listed[SCORES]
-        inside = _scan(entry / SCORES, f"{SCORES}/", findings)
-        if not inside:
-            findings.refuse(SCORES, "", "is empty: remove it")
-        listed |= inside
-    sizes = {}
+    listed = _scan(entry, findings)
+    sound = []
     for name, status in sorted(listed.items()):
         if complaint := _complaint(name, status):
             findings.refuse(plain(name), "", complaint)
         else:
-            sizes[name] = status.st_size
+            sound.append(name)
     for name in MOST_PLAIN:
         first, *others = [form for form in forms(name) if form in listed] or [name]
         for other in others:
@@ -128,24 +118,19 @@ def read_files(entry: Path, findings: Findings) -> dict[str, bytes]:
     for name in (ENTRY, RECORDS):
         if listed.keys().isdisjoint(forms(name)):
             findings.refuse(name, "", "is missing")
-    if (total := sum(sizes.values())) > MOST_TOTAL_BYTES:
-        message = f"is {total} bytes, expected at most {MOST_TOTAL_BYTES}"
-        findings.refuse("files", "total size", message)
-        return {}
     contents = {}
-    for name in sizes:
+    for name in sound:
         with findings.reading(name):
-            most = MOST_BYTES.get(name, MOST_SCORE_BYTES)
-            contents[name] = read_bytes(entry / name, most, ResultsError)
+            contents[name] = read_bytes(entry / name, MOST_BYTES[name], ResultsError)
     return contents
 
 
-def _scan(directory: Path, prefix: str, findings: Findings) -> dict[str, os.stat_result]:
-    with findings.reading(prefix or "entry"), os.scandir(directory) as items:
+def _scan(directory: Path, findings: Findings) -> dict[str, os.stat_result]:
+    with findings.reading("entry"), os.scandir(directory) as items:
         first = list(islice(items, MOST_FILES + 1))
         if len(first) > MOST_FILES:
             raise ResultsError(f"holds more than {MOST_FILES} files")
-        return {prefix + item.name: item.stat(follow_symlinks=False) for item in first}
+        return {item.name: item.stat(follow_symlinks=False) for item in first}
     return {}
 
 
@@ -153,11 +138,11 @@ def _complaint(name: str, status: os.stat_result) -> str:
     """Return what is wrong with a file before it is opened; empty if nothing is."""
     if stat.S_ISLNK(status.st_mode):
         return "is a symbolic link, expected plain files"
-    if name not in MOST_BYTES and not _SCORE_FILE.fullmatch(name):
-        return f"is no file of an entry: expected {', '.join(MOST_BYTES)}, {SCORES}/*.h5"
+    if name not in MOST_BYTES:
+        return f"is no file of an entry: expected {', '.join(MOST_BYTES)}"
     if not stat.S_ISREG(status.st_mode):
         return "is no plain file"
-    if status.st_size > (most := MOST_BYTES.get(name, MOST_SCORE_BYTES)):
+    if status.st_size > (most := MOST_BYTES[name]):
         return f"has {status.st_size} bytes, expected at most {most}"
     return ""
 

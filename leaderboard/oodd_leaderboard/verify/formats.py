@@ -105,7 +105,6 @@ PLUGIN_NAME: Final = _matching(
     "'distribution:plug-in', both of letters, digits, '.', '_', '-'",
 )
 SCORE_KEY: Final = _matching(r"[a-z0-9][a-z0-9._-]{0,159}", "a score file's name, bare")
-GRANTED_BY: Final = _text(200, least=1)
 _COST: Final = Rule(
     lambda value: value is None or math.isnan(value) or 0 <= value <= MOST_COST,
     f"a number from 0 to {MOST_COST:g}, or null",

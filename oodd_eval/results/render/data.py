@@ -13,7 +13,6 @@ from oodd_eval.data.bounded import without_nan
 from oodd_eval.metrics.catalogue import NAMES
 from oodd_eval.results.board import Value
 from oodd_eval.results.compare import MEANINGS, Comparison, Difference
-from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import NAN, Metric, Record
 from oodd_eval.results.render import renders
 from oodd_eval.results.report import Report, by_suite, flat, message
@@ -32,7 +31,7 @@ def cells_as_json(report: Report) -> str:
     return json.dumps(without_nan(flat(report.records)), indent=1) + "\n"
 
 
-def ranking_csv(ranks: RankedBoard, trust: Mapping[Setting, str]) -> str:
+def ranking_csv(ranks: RankedBoard) -> str:
     """Return one line per row: rank, cost, and every metric over all cells with its interval."""
     board = ranks.board
     metrics = dict.fromkeys(name for r in board.records for name in r.metrics)
@@ -55,11 +54,9 @@ def ranking_csv(ranks: RankedBoard, trust: Mapping[Setting, str]) -> str:
                 "overrides": row.entry.overrides_json,
                 "trivial": str(row.trivial).lower(),
                 "primary": str(row.primary).lower(),
-                "clone_of": str(row.clone_of or ""),
                 "training": row.training,
                 "seeds": row.seeds,
                 "inputs": row.inputs,
-                "trust": trust.get(row.entry, ""),
                 "win_rate": number(row.wins),
                 "lead": row.lead,
                 "seconds_fit": number(row.cost.fit),

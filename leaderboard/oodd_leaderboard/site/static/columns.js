@@ -52,9 +52,6 @@ function paperColumn(metric, title, unit, kind) {
   };
 }
 
-/** A rank as shown: in brackets where it is the one that the row would have. */
-const rankText = (row, rank) => row.below ? `(${rank})` : String(rank);
-
 const RANK = plainColumn(
   "rank", "Rank", "", "1 plus the number of rows that are significantly better over all cells",
   (row) => row.rank,

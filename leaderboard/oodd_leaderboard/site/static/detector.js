@@ -46,9 +46,8 @@ function summary(board, row) {
     const { kind } = DATA.metrics[metric];
     return isNumber(low) ? `95 % interval ${show(low, kind)} to ${show(high, kind)}` : "no interval";
   };
-  const rank = card("Rank", row.rank ? rankText(row, row.rank) : UNDEFINED, !row.rank ? row.state : row.below
-      ? "would have: not run again by maintainers"
-      : `of ${board.rows.filter((r) => r.rank && !r.below).length} ranked${row.ties && `, tie groups ${row.ties}`}`);
+  const rank = card("Rank", row.rank ? String(row.rank) : UNDEFINED, !row.rank ? row.state
+    : `of ${board.rows.filter((r) => r.rank).length} ranked${row.ties && `, tie groups ${row.ties}`}`);
   const cost = card("Cost", `${costText(row.cost.fit)} s`, `per fit; ${costText(row.cost.step)} \u00b5s per step, ${costText(row.cost.peak)} MB`);
   const clock = board.rows.find((r) => r.label === "clock");
   const beside = (metric) => metric === "auc_rows" && clock
@@ -288,8 +287,6 @@ function facts(row) {
     list([
       ["Entry", entry.id],
       ["Submitted by", entry.submitter],
-      ["Trust", `${row.trust}: ${TRUST[row.trust]}`],
-      ["Granted by", entry.grant && `${entry.grant.by} on ${entry.grant.day}: ${entry.grant.how}`],
       ["Date", entry.created],
       ["To run it again", element("code", {}, command)],
       ["Citation", element("div", {}, element("pre", { class: "bibtex" }, bibtexOf(row, entry)),

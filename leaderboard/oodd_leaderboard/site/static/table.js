@@ -81,8 +81,7 @@ function rankOfView(board = currentBoard()) {
 /** The key of the column that the table is sorted by; on a first visit that of the metric that ranks. */
 const sortKey = (board) => state.sort === DEFAULTS.sort ? board.ranking : state.sort;
 
-/** Sort by a column, by the metric that ranks when the view has no such column; what has no value last.
- * By rank and by that metric, what was not run again stands below what was. */
+/** Sort by a column, by the metric that ranks when the view has no such column; what has no value last. */
 function sorted(board, rows, columns) {
   const label = (a, b) => a.label < b.label ? -1 : Number(a.label > b.label);
   if (state.sort === "label") return [...rows].sort((a, b) => (state.ascending ? 1 : -1) * label(a, b));
@@ -93,8 +92,7 @@ function sorted(board, rows, columns) {
   return [...rows].sort((a, b) => {
     const [x, y] = [value(a), value(b)];
     const defined = isNumber(y) - isNumber(x);
-    const below = column && !["rank", "alarm_rank", board.ranking].includes(column.key) ? 0 : a.below - b.below;
-    return below || defined || sign * (x - y) || matched(b) - matched(a) || label(a, b);
+    return defined || sign * (x - y) || matched(b) - matched(a) || label(a, b);
   });
 }
 
@@ -134,7 +132,7 @@ async function drawTable() {
   if (body?.key !== key) body = { key, lines: linesOf(board, rows, lines, columns) };
   const focused = document.activeElement?.dataset?.key;
   const all = [{ ...rankOfView(), class: "rank" }, DETECTOR, ...columns];
-  explain(board, all);
+  explain(all);
   const table = element("table", { id: "ranking", class: "board" },
     captionOf(what(board, rows)),
     element("thead", {}, element("tr", {}, all.map((column) => header(column, all)))),
@@ -167,7 +165,7 @@ function bestOf(column, values) {
 
 const DETECTOR = {
   key: "label", title: "Detector", unit: "", class: "left",
-  hint: "Name, and settings that are not defaults; below it horizon, inputs, seeds and trust",
+  hint: "Name, and settings that are not defaults; below it horizon, inputs and seeds",
 };
 
 /** A column's title, which ends its lines before a number and its unit, not between. */
@@ -187,10 +185,9 @@ function sayMeaning(columns, column) {
 }
 
 /** What all columns and marks of the table mean, to be unfolded above it. */
-function explain(board, columns) {
+function explain(columns) {
   sayMeaning(columns, null);
-  const lines = [...columns.map(meaningOf), ...trustsOf(board).map((trust) => [element("strong", {}, trust), `: ${TRUST[trust]}.`])];
-  document.getElementById("meanings").replaceChildren(...lines.map((line) => element("li", {}, line)));
+  document.getElementById("meanings").replaceChildren(...columns.map((column) => element("li", {}, meaningOf(column))));
 }
 
 function header(column, columns) {
@@ -210,7 +207,7 @@ function header(column, columns) {
 function tableRow({ row, others, open, variant }, columns, values, best, start) {
   const rank = rankOfView().of(row).value;
   return element("tr", { class: [row.trivial && "trivial", variant && "variant"].filter(Boolean).join(" ") || null, "data-row": row.id },
-    element("td", { class: "rank" }, isNumber(rank) ? rankText(row, rank) : element("span", { title: row.state }, UNDEFINED),
+    element("td", { class: "rank" }, isNumber(rank) ? String(rank) : element("span", { title: row.state }, UNDEFINED),
       rankOfView() === RANK && row.ties && element("span", { class: "ties", title: "Tie groups: rows that share a letter cannot be told apart" }, row.ties)),
     element("th", { scope: "row" },
       element("a", { href: address("detector", row.id) }, breakable(row.label)), " ", badges(row),
@@ -240,22 +237,13 @@ function foldButton(row, others, open) {
   }, open ? `\u2212 hide ${text}` : `+ ${text}`);
 }
 
-/** What stands under a label: horizon, inputs, seeds, trust. */
+/** What stands under a label: horizon, inputs, seeds. */
 function underLabel(row) {
   const parts = [`\u0394\u202f=\u202f${row.horizon}`];
   if (row.inputs) parts.push(row.inputs.replace("+", " + "));
   if (row.seeds.length > 1) parts.push(`${row.seeds.length}\u00a0seeds`);
-  return [...parts.map((part) => `${part}\u00a0\u00b7 `), element("span", { class: "trust", title: TRUST[row.trust] }, row.trust)];
+  return parts.join("\u00a0\u00b7 ");
 }
-
-const TRUST = {
-  "reported": "numbers as submitted, checked for consistency",
-  "re-scored": "numbers computed by maintainers from the submitted scores",
-  "re-run": "fitted and scored again by maintainers",
-};
-
-/** Levels of trust that rows of a board have, the lowest first. */
-const trustsOf = (board) => Object.keys(TRUST).filter((trust) => board.rows.some((row) => row.trust === trust));
 
 /** True for a row that learns from more than nominal trajectories of the split. */
 function isTrainedOnMore(row) {
@@ -265,7 +253,6 @@ function isTrainedOnMore(row) {
 function badges(row) {
   return [
     row.trivial && element("span", { class: "badge", title: "Knows nothing of the dynamics: what a detector has to beat" }, "trivial"),
-    row.clone_of && element("span", { class: "badge", title: "Has the scores of that row, and pushes no other row down" }, breakable(`= ${row.clone_of}`)),
     isTrainedOnMore(row) && element("span", { class: "badge", title: "Learns from more than nominal trajectories of the split: not ranked" }, `trained on ${row.training}`),
     row.training === "oracle" && element("span", { class: "badge", title: "Has the true equations of the environment: not ranked" }, "oracle"),
   ];
@@ -308,8 +295,6 @@ function what(board, rows) {
 
 /** Sentences below a table that has such rows. */
 const NOTES = [
-  [(row) => row.below, "Ranked are rows that maintainers have run again on seeds of their own. The others stand below, in brackets the rank that they would have, and push no row down."],
-  [(row) => row.clone_of, "A row with = and another\u2019s name has that row\u2019s scores. It has the same rank, and pushes no other row down."],
   [isTrainedOnMore, "Rows trained on more than nominal trajectories of the split are not ranked."],
   [(row) => row.training === "oracle", "An oracle has the true equations of the environment. It says how far the limit is, and is not ranked."],
   [(row) => row.lead && isSummary(state), "Lead: in how many of the cases in which one environment is left out the row\u2019s mean stays above that of the next rank."],
@@ -321,7 +306,6 @@ function notesOf(board, rows) {
   const lines = [
     `Split ${board.split}, digest ${board.digest.slice(0, 12)}, protocol ${board.protocol}, ` +
     `${board.paired ? `${board.tests.join(", ")} test seeds per environment` : "episodes without twins"}${limit}. Tables never mix splits or protocols.`,
-    `Trust: ${trustsOf(board).map((trust) => `${trust}, ${TRUST[trust]}`).join("; ")}.`,
     ...board.about,
     selectsLess(state) && "Ranks, tie groups and wins are those over all cells of the board, whatever is selected.",
     !isSummary(state) && `Over single environments or anomalies only ${rankingName(board)} has intervals here; every detector's page has those of single cells.`,
