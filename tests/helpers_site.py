@@ -151,9 +151,9 @@ def example(root):
             *records("riqn", level=0.8, horizon=10, inputs="observations+actions"),
             *records("rf", seed=0), *records("rf", seed=1),
         ],
-        curves=("riqn",), trust="re-run", caption="Three members instead of five.",
+        curves=("riqn",), caption="Three members instead of five.",
     )  # fmt: skip
-    write_entry(root, "trivial", [*records("persistence"), *records("clock")], trust="re-scored")
+    write_entry(root, "trivial", [*records("persistence"), *records("clock")])
     broken = {("hopper", "iid"), ("hopper", "drift")}
     write_entry(
         root, "third-party",

@@ -141,20 +141,6 @@ def of_protocols(name: str) -> str:
     )
 
 
-@functools.cache
-def run_again() -> dict[str, dict[str, list[float]]]:
-    """Return means of an entry on `standard` and of its re-run by row and metric."""
-    grants = json.loads((BOARD / "trust.json").read_text(encoding="utf-8"))["grants"]
-    means = [grant["means"] for entry, grant in grants.items() if entry.endswith("-standard")]
-    return dict(row for of_entry in means for row in of_entry.items())
-
-
-def of_rerun(name: str) -> str:
-    """Return three metrics of a row, each on the board and on fresh seeds."""
-    metrics = ("auc_matched", "found_within_20_at_5pct", "false_episodes_at_5pct")
-    return cells(100 * value for metric in metrics for value in run_again()[name][metric])
-
-
 def thresholds(suite: str, name: str) -> list[str]:
     """Return the threshold of a row on a suite's page, and the shares that it finds by rung."""
     row = overview(suite, name)
@@ -232,7 +218,6 @@ TABLES: dict[str, Row] = {
     "noise kinds": of_kind_under_noise,
     "oracles": beside_oracle,
     "protocols": of_protocols,
-    "run again": of_rerun,
     "losses mini-paper": of_reproductions("mini", "mini-paper"),
     "losses reduced-paper": of_reproductions("standard", "reduced-paper"),
     "ladder": of_ladder,

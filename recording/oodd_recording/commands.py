@@ -127,12 +127,11 @@ def record_split(
     environments: Sequence[str] = tuple(ENVIRONMENTS),
     output: Path | None = None,
     *,
-    bits: int | None = None,
     policies: Mapping[str, Path] | None = None,
 ) -> None:
     """Record a split, by default of all environments and where splits are found.
 
-    See `build_split` for the `bits` and `policies`.
+    `policies` are files of others, as `build_split` takes them.
     """
     directory = output or data_home() / definition.name
     notes = make_console(quiet=options.verbosity < 0)
@@ -140,7 +139,6 @@ def record_split(
         definition,
         directory,
         environments=environments,
-        bits=bits,
         policies=policies,
         jobs=options.jobs,
         progress=lambda n, total, what: notes.print(f"{n}/{total}  {what}"),

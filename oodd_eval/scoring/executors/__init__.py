@@ -24,8 +24,8 @@ class RunSettings:
     each worker. A `launcher`, such as a sandbox, starts the workers of this machine. `fresh` fits
     again what the results directory has. `executor` is ``"local"`` or ``"dask://HOST:PORT"``. After
     `deadline` seconds nothing new is begun. `command` is the command line, for the provenance of
-    records. `streamed` hands a detector one row at a time and waits for its score before the next,
-    as re-runs do. `row_metrics` adds metrics that are computed on request.
+    records. `streamed` hands a detector one row at a time and waits for its score before the next;
+    no command asks for it. `row_metrics` adds metrics that are computed on request.
     """
 
     jobs: int | None = None
