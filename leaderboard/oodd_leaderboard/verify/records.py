@@ -114,8 +114,9 @@ def check_together(
         if (first := seen.setdefault(record.cell, where)) != where:
             findings.refuse(where, "cell", f"is there twice: it is that of {first} too")
         if cells and record.position not in cells:
+            field = "anomaly" if record.environment in dict(cells) else "environment"
             cell = short("/".join(record.position))
-            findings.refuse(where, "anomaly", f"{cell} is no cell of split {entry.split}")
+            findings.refuse(where, field, f"{cell} is no cell of split {entry.split}")
         positions[record.cell.label].add(record.position)
     if (rows := len({record.setting for record in records.values()})) > MOST_ROWS:
         findings.refuse(RECORDS, "rows", f"are {rows}, expected at most {MOST_ROWS} of one entry")
