@@ -9,7 +9,6 @@ document is not that of what is committed: in these tables, in sentences beside 
 
 import functools
 import io
-import json
 import os
 import re
 import sys
