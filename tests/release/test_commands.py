@@ -51,7 +51,7 @@ def test_help_of_a_group_needs_no_extra_of_its_commands(capsys, monkeypatch):
     monkeypatch.setattr(cli_package, "load", import_all_but_recording)
     assert cli.main(["leaderboard", "--help"]) == 0
     text = capsys.readouterr().out
-    assert "  rerun " in text
+    assert "  submit " in text
     assert "oodd-eval leaderboard verify" in text.partition("\nExamples:\n")[2]
 
 
