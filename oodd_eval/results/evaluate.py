@@ -360,9 +360,9 @@ def _with_metrics(
         condition = str(record.condition)
         metrics, terms = cell_metrics(cell, rules, condition=condition, rows=rows, **settings)
         return replace(record, metrics=metrics, per_trajectory=_terms(terms))
-    known, note = data.anomalous(record.condition), ""
+    episodes, note = data.anomalous(record.condition), ""
     explained = scores.explained.get(record.condition.part, [])
-    corrupted = [p.get("sensors", ()) for p in known.parameters] if explained else ()
+    corrupted = [p.get("sensors", ()) for p in episodes.parameters] if explained else ()
     metrics, terms = cell_metrics(cell, rules, explained=explained, corrupted=corrupted, **settings)
     if data.logs is not None:
         before = auc_before(*cell[:3])
@@ -371,7 +371,7 @@ def _with_metrics(
         if note := _distrusted(before.value):
             for name in NEED_TWINS:
                 del metrics[name], terms[name]
-    brief = bool(known.brief)
+    brief = bool(episodes.brief)
     return replace(record, metrics=metrics, per_trajectory=_terms(terms), brief=brief, note=note)
 
 
@@ -409,15 +409,16 @@ def cell_scores(
     """
     nominal, facts = parts[TWINS], data.logs or LogFacts()
     if data.paired:
-        anomalous, twins_of = parts[record.condition.part], data.anomalous(record.condition)
-        rows = (rows[: len(anomalous)].tolist() for rows in (twins_of.onsets, twins_of.effects))
+        anomalous, episodes = parts[record.condition.part], data.anomalous(record.condition)
+        rows = (rows[: len(anomalous)].tolist() for rows in (episodes.onsets, episodes.effects))
         return PairedScores(anomalous, nominal, *rows)
     cell = UnpairedScores(nominal, [], [], data.twins.tasks[: len(nominal)], [], facts.clock)
     if record.condition == NOMINAL:
         return cell
-    anomalous, known = parts[record.condition.part], data.labelled(record.condition)
+    anomalous, labelled = parts[record.condition.part], data.labelled(record.condition)
     n = len(anomalous)
-    return replace(cell, anomalous=anomalous, intervals=known.intervals[:n], tasks=known.tasks[:n])
+    intervals, tasks = labelled.intervals[:n], labelled.tasks[:n]
+    return replace(cell, anomalous=anomalous, intervals=intervals, tasks=tasks)
 
 
 def _terms(contributions: Mapping[str, Contribution]) -> dict[str, NDArray[np.float64]]:

@@ -394,8 +394,8 @@ class StrengthTables:
         return Table(title, ["detector", *titles], rows, note=note)
 
     def _kinds(self, pairs: Iterable[Pair]) -> list[str]:
-        known = {kind for _, kind in pairs}
-        return [kind for kind in self.board.anomalies if kind in known]
+        kinds = {kind for _, kind in pairs}
+        return [kind for kind in self.board.anomalies if kind in kinds]
 
     def _with_unit(self, kind: str) -> str:
         return f"{kind} ({self.units[kind]})" if kind in self.units else kind

@@ -107,7 +107,7 @@ const tableOf = (attributes, caption, titles, lines) => element("table", attribu
   element("tbody", {}, lines));
 
 /** A line of a table: its heading, and cells that are texts or elements. */
-const lineOf = (heading, cells, attributes = {}) => element("tr", attributes, element("th", { scope: "row" }, heading),
+const lineOf = (heading, cells, hint = null) => element("tr", {}, element("th", { scope: "row", title: hint }, heading),
   cells.map((cell) => cell instanceof Element && cell.tagName === "TD" ? cell : element("td", {}, cell)));
 
 const isDark = () => document.documentElement.dataset.theme === "dark";

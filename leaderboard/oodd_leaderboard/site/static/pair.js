@@ -74,7 +74,7 @@ function pairFigure(board, rows) {
 /** Five figures of both rows, or as many of them as the board has. */
 function shortTable(board, rows) {
   const metrics = shortList(board).filter((metric) => metric === board.ranking || !metric.startsWith("auc"));
-  const short = (title, meaning, texts) => lineOf([title, element("span", { class: "under" }, sentence(meaning))], texts);
+  const short = (title, meaning, texts) => lineOf([title, element("span", { class: "under" }, sentence(meaning))], texts, meaning);
   return scroller(tableOf({ class: "plain short", id: "short" }, "In short: means over all cells",
     ["Metric", ...rows.map((row) => breakable(row.label))], [
       ...metrics.map((metric) => short(withUnit(metric), DATA.metrics[metric].meaning, rows.map((row) => meanText(mean(board, row, metric), DATA.metrics[metric].kind)))),
