@@ -92,18 +92,13 @@ def test_the_description_of_logs_says_what_is_known_of_them(logs, tmp_path):
     plain = describe(load_split(make_log_split(tmp_path / "plain")))
     for nothing in ("source", "licence", "rate:", "baseline", "offsets", "outcome only"):
         assert nothing not in plain
-    for line in (
-        "6 training, 40 calibration and 8 nominal test episodes; imported",
-        "source: https://example.org/arm",
-        "licence: CC BY 4.0",
-        "citation: Someone, 2024",
-        "rate: 50 rows/s",
-        "order: shuffled",
-        "offsets: subtracted in float64: q0 5400000",
-    ):
-        assert line in text.splitlines()
+    lines = {
+        "6 training, 40 calibration and 8 nominal test episodes; imported", "order: shuffled",
+        "source: https://example.org/arm", "licence: CC BY 4.0", "citation: Someone, 2024",
+        "rate: 50 rows/s", "offsets: subtracted in float64: q0 5400000",
+    }  # fmt: skip
+    assert lines <= {*text.splitlines()}
     assert "first 20 rows" in text
-    assert "clock:" in text
     for nothing in ("Table 2", "±", "return", "policy", "arm arm", "redraws", "tasks"):
         assert nothing not in text
 
