@@ -160,14 +160,14 @@ def test_a_missing_or_failing_cell_of_the_reference_fails():
         ("same", False), ("failed", True), ("missing", True), ("new", False),
     ]  # fmt: skip
     assert found.differences[1].reason == "timeout: broke"
-    # What failed in the reference already does not fail.
-    reference = [record("iid", status="oom"), record("drift", status="oom")]
-    now = [record("iid", status="error"), record("drift")]
-    assert verdicts(now, reference, AUC) == ["same", "recovered"]
-    assert not against(now, reference, AUC).failures
-    assert len(against(now, reference, AUC, two_sided=True).failures) == 1
     with pytest.raises(UsageError, match="'missed_at_1pct' is not in records"):
         against(now, reference, parse_tolerance("missed_at_1pct:0.1"))
+    # What failed in the reference already does not fail.
+    failed = [record("iid", status="oom"), record("drift", status="oom")]
+    later = [record("iid", status="error"), record("drift")]
+    assert verdicts(later, failed, AUC) == ["same", "recovered"]
+    assert not against(later, failed, AUC).failures
+    assert len(against(later, failed, AUC, two_sided=True).failures) == 1
 
 
 def test_without_tolerances_nothing_with_a_worse_side_may_get_worse():

@@ -1,12 +1,10 @@
 """Runs that hand over one row at a time: the same scores, and nothing of what comes later."""
 
-import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from helpers_plugins import install
-from oodd_leaderboard.sandbox.launcher import Sandbox
 
 from oodd_eval import load_split
 from oodd_eval.data.parts import lengths_of, parts_of
@@ -19,8 +17,6 @@ from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.scoring.executors import RunSettings
 from oodd_eval.scoring.plan import make_plan
 from oodd_eval.scoring.runner import run
-
-boxed = pytest.mark.skipif(not shutil.which("bwrap"), reason="needs bubblewrap")
 
 PLUGIN = """
 class Whole(Good):
@@ -53,24 +49,18 @@ class Raises(Rows):
         if super().update(observation, action) and self.n > 5: raise KeyError("row five")
         return 1.0
 
-class Unfit(Rows):
-    def restore(self, state): raise ValueError("no such state")
-    def state(self): return {"x": np.ones(3)}
-
 @hookimpl
 def oodd_detectors():
     both = DetectorSpec("rows", Rows, "a test's", inputs="observations+actions")
-    return [both, *offer(whole=Whole, no_float=NoFloat, late_nan=LateNan, raises=Raises,
-                         unfit=Unfit)]
+    return [both, *offer(whole=Whole, no_float=NoFloat, late_nan=LateNan, raises=Raises)]
 """
 
 
-def run_rows(detector, split, output=None, *, streamed=True, sandboxed=False, **parameters):
+def run_rows(detector, split, output=None, *, streamed=True, **parameters):
     opened, plugins = load_split(split), discover()
     plan = make_plan(plugins, split=opened, detectors=[detector], environments=["cartpole"],
                      anomalies=["iid"], parameters=parameters)  # fmt: skip
-    launcher = Sandbox(()) if sandboxed else None
-    settings = RunSettings(jobs=1, limits=Limits(120), launcher=launcher, streamed=streamed)
+    settings = RunSettings(jobs=1, limits=Limits(120), streamed=streamed)
     results = ResultsDirectory(output) if output else None
     (record,) = run(plan, opened, plugins, settings, results).records
     if not output:
@@ -118,9 +108,8 @@ def test_a_row_comes_with_the_action_before_it(plugin, tiny_split, tmp_path):
             assert np.allclose(found, expected, atol=1e-3)
 
 
-@pytest.mark.parametrize("sandboxed", [False, pytest.param(True, marks=boxed)])
-def test_without_update_a_row_is_the_last_of_a_prefix(plugin, tiny_split, tmp_path, sandboxed):
-    record, parts, sets = run_rows("whole", tiny_split, tmp_path / "out", sandboxed=sandboxed)
+def test_without_update_a_row_is_the_last_of_a_prefix(plugin, tiny_split, tmp_path):
+    record, parts, sets = run_rows("whole", tiny_split, tmp_path / "out")
     assert record.ok, record.reason
     scale = sum(map(len, load_split(tiny_split).environment("cartpole").train))
     for part, sequences in parts.items():
@@ -141,11 +130,10 @@ def test_without_update_long_episodes_are_incompatible(plugin, tiny_split, monke
         ("no-float", "invalid", "update returned NoneType, expected a float"),
         ("late-nan", "invalid", "returned nan at t = 5 of cartpole/"),
         ("raises", "error", "KeyError: 'row five'"),
-        pytest.param("unfit", "error", "ValueError: no such state", marks=boxed),
     ],
 )
 def test_a_failure_at_a_row_is_a_state_with_a_reason(plugin, tiny_split, detector, status, reason):
-    record = run_rows(detector, tiny_split, sandboxed=detector == "unfit")
+    record = run_rows(detector, tiny_split)
     assert (record.status, reason in record.reason) == (status, True), record.reason
 
 
