@@ -64,32 +64,24 @@ def test_the_stretched_arm_weighs_what_its_masses_and_lengths_say():
     assert abs(stretched_torque()) == pytest.approx(59.7564, abs=1e-4)
 
 
-def test_a_hovering_drone_carries_its_weight():
-    speed = [hover_speed()] * 4
-    thrust = DRONE.value("thrust").tolist()
-    force = wrench(speed, thrust, [1.0, 0.0, 0.0, 0.0], [0.0] * 3, (0.0, 0.0))
-    weight = DRONE.value("mass") * DRONE.value("gravity")
-    np.testing.assert_allclose(force, [0, 0, weight, 0, 0, 0], atol=1e-12)
+def test_a_hovering_drone_carries_its_weight_and_drag_is_the_product_of_speed_and_wind():
+    def force(speed, wind):
+        return wrench([speed] * 4, thrust, [1.0, 0.0, 0.0, 0.0], [0.0] * 3, (wind, 0.0))
+
+    thrust, weight = DRONE.value("thrust").tolist(), DRONE.value("mass") * DRONE.value("gravity")
+    np.testing.assert_allclose(force(hover_speed(), 0.0), [0, 0, weight, 0, 0, 0], atol=1e-12)
+    drag = force(400.0, 2.0)[0] - force(400.0, 0.0)[0]
+    assert drag == pytest.approx(DRONE.value("rotor drag") * 1600 * 2.0, rel=1e-12)
 
 
 def test_levels_at_three_volts_are_those_of_the_closed_form():
-    expected = [12.263, 12.783, 1.634, 1.409]  # cm
-    np.testing.assert_allclose(steady_levels(Tank(), [3.0, 3.0]), expected, atol=5e-4)
-
-
-def test_tanks_come_to_rest_at_their_steady_levels():
     tank = Tank()
     tank.reset(seed=1)
+    expected = [12.263, 12.783, 1.634, 1.409]  # cm
+    np.testing.assert_allclose(steady_levels(Tank(), [3.0, 3.0]), expected, atol=5e-4)
     for _ in range(2000):
         tank.step(np.full(2, 3.0, np.float32))
     np.testing.assert_allclose(tank.level, steady_levels(tank, [3.0, 3.0]), atol=1e-6)
-
-
-def test_a_drag_of_rotors_slows_a_drone_as_the_product_of_speed_and_wind():
-    speed, thrust = [400.0] * 4, DRONE.value("thrust").tolist()
-    still = wrench(speed, thrust, [1.0, 0.0, 0.0, 0.0], [0.0] * 3, (0.0, 0.0))
-    windy = wrench(speed, thrust, [1.0, 0.0, 0.0, 0.0], [0.0] * 3, (2.0, 0.0))
-    assert windy[0] - still[0] == pytest.approx(DRONE.value("rotor drag") * 1600 * 2.0, rel=1e-12)
 
 
 @pytest.mark.parametrize("world", WORLDS)
