@@ -32,11 +32,6 @@ def fitted(**changes):
     return make_rf(**{**SMALL, **changes}).fit(NOMINAL)
 
 
-@pytest.fixture(scope="module")
-def rf():
-    return fitted()
-
-
 def test_windows_repeat_the_first_observation_of_their_own_trajectory():
     rows = Rows.stack(
         [Trajectory([[1.0], [2.0]], [[0.0]]), Trajectory([[3.0], [4.0]], [[0.0]])],
@@ -77,13 +72,6 @@ def test_score_is_the_mean_distance_in_standard_deviations():
     np.testing.assert_array_equal(rf.score(x), [np.nan, 0.375, 0.0])
 
 
-def test_members_differ_in_seed_window_and_settings(rf):
-    members = fitted(members=6).members_
-    assert [m.window for m in members] == [4, 3, 2, 1, 4, 3]
-    assert len({m.trees[0].threshold.tobytes() for m in members}) == 6
-    assert len(set(MEMBERS)) == 5
-
-
 def test_forecasts_beat_persistence_on_held_out_trajectories():
     rf = make_rf(members=3).fit([episode(seed) for seed in range(100, 140)])
     x = episode(60)
@@ -91,7 +79,11 @@ def test_forecasts_beat_persistence_on_held_out_trajectories():
     assert np.nanmean(rf.score(x)) < 0.5 * moved
 
 
-def test_size_of_training_and_trees_is_bounded():
+def test_members_differ_and_the_size_of_training_and_trees_is_bounded():
+    members = fitted(members=6).members_
+    assert [m.window for m in members] == [4, 3, 2, 1, 4, 3]
+    assert len({m.trees[0].threshold.tobytes() for m in members}) == 6
+    assert len(set(MEMBERS)) == 5
     for draws, drawn in ((20, 20), (100, 30)):
         rf = make_rf(members=1, trees=2, leaves=8, rows=30, draws=draws).fit(NOMINAL)
         for tree in rf.members_[0].trees:
