@@ -21,8 +21,8 @@ from pathlib import Path
 import numpy as np
 from oodd_recording.build import Chunk, record_chunk
 from oodd_recording.environments import make
-from oodd_recording.info import info_of
 from oodd_recording.policies import load_policy
+from oodd_recording.registered import info_of
 from oodd_recording.simulator import quiet_streams
 from oodd_worlds import oodd_anomalies, oodd_environments
 

@@ -16,8 +16,8 @@ from contextlib import closing
 from pathlib import Path
 
 import numpy as np
+from oodd_recording.closed_loop import record_nominal
 from oodd_recording.policies import load_policy
-from oodd_recording.record import record_nominal
 from scipy.stats import betabinom, binom
 
 from oodd_eval import load_split

@@ -14,7 +14,7 @@ from concurrent.futures import ProcessPoolExecutor
 
 import numpy as np
 from oodd_recording.calibrate import kept_shares, measure, twins_of
-from oodd_recording.record import return_of
+from oodd_recording.closed_loop import return_of
 
 from oodd_eval.data.condition import RUNGS, WHOLE, all_rungs_of
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS

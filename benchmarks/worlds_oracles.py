@@ -13,9 +13,9 @@ import argparse
 from collections import defaultdict
 
 import numpy as np
+from oodd_recording.closed_loop import Setup, record_anomalous
 from oodd_recording.environments import make
 from oodd_recording.policies import load_policy
-from oodd_recording.record import Setup, record_anomalous
 from oodd_worlds import oodd_anomalies, oodd_environments
 from oodd_worlds.oracles import MODELS, charts_of, judged, standards_of
 from tabulate import tabulate

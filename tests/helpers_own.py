@@ -9,8 +9,8 @@ from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS
 def forget_own():
     """Forget environments and anomalies that were registered: another test has others."""
     known_by_module = [registry._environments, registry._anomalies]
-    if "oodd_recording.info" in sys.modules:
-        info = sys.modules["oodd_recording.info"]
+    if "oodd_recording.registered" in sys.modules:
+        info = sys.modules["oodd_recording.registered"]
         known_by_module += [info._infos, info.MEASURED]
     for known in known_by_module:
         for name in [n for n in known if n not in {*ENVIRONMENTS, *ANOMALIES}]:

@@ -35,7 +35,7 @@ class Reflex:
 
 def record(environment, anomaly, seed, *, policy, episode_cap=None):
     """Record one episode: nominal, or with an anomaly from a random onset on."""
-    from oodd_recording.record import record_seed
+    from oodd_recording.closed_loop import record_seed
 
     condition = None if anomaly is None else Condition(anomaly)
     options = {"policy": policy, "episode_cap": episode_cap}

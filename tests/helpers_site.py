@@ -11,14 +11,14 @@ from oodd_leaderboard import site
 from oodd_leaderboard.curve_file import write_curves
 from oodd_leaderboard.curves import Sweep, cell_curves, thresholds
 from oodd_leaderboard.entry import EntryInfo, SubmittedEntry, read_entries, sections, suite_sections
-from oodd_leaderboard.site.data import site_data
+from oodd_leaderboard.site.content import site_data
 
 from oodd_eval.data.condition import rungs_of
 from oodd_eval.metrics.auc import AlarmRule, Contribution
 from oodd_eval.metrics.catalogue import GUARANTEED, RANKING
 from oodd_eval.metrics.cusum import Standardization
 from oodd_eval.metrics.recalibration import PairedScores
-from oodd_eval.results.compare import write_reference
+from oodd_eval.results.comparison import write_reference
 from oodd_eval.results.evaluate import metric_of
 from oodd_eval.results.strengths import DETECTION
 

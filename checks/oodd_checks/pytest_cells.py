@@ -18,7 +18,7 @@ from oodd_eval.metrics.catalogue import NAMES
 from oodd_eval.names import counted, select
 from oodd_eval.plugins.discovery import Plugins, discover
 from oodd_eval.results.board import Conditions
-from oodd_eval.results.compare import (
+from oodd_eval.results.comparison import (
     Difference,
     RecordSet,
     compare,

@@ -13,11 +13,11 @@ from oodd_eval.errors import OutputError, ResultsError, UnknownNameError, UsageE
 from oodd_eval.metrics.catalogue import NAMES
 from oodd_eval.names import counted, expression, select
 from oodd_eval.prose import print_prose, print_table
-from oodd_eval.results import compare as regression
+from oodd_eval.results import comparison as regression
 from oodd_eval.results.board import ranked_by
-from oodd_eval.results.compare import RecordSet, read_record_set, write_reference
+from oodd_eval.results.comparison import RecordSet, read_record_set, write_reference
 from oodd_eval.results.record import Record
-from oodd_eval.results.render.data import junit
+from oodd_eval.results.render.tabular import junit
 from oodd_eval.results.render.text import markdown_section
 from oodd_eval.results.report import comparison_section
 from oodd_eval.results.standings import PairedComparison, compare_rows

@@ -7,8 +7,8 @@ import click
 
 from oodd_eval.cli import DIRECTORY, Name, Options, command
 from oodd_eval.cli.console import make_console
+from oodd_eval.data.description import describe
 from oodd_eval.data.fetch import fetch as fetch_split
-from oodd_eval.data.info import describe
 from oodd_eval.data.parts import EnvironmentData
 from oodd_eval.data.split import load_split
 from oodd_eval.names import counted

@@ -52,8 +52,11 @@ DATA: Final[Commands] = {
 }
 
 LEADERBOARD: Final[Commands] = {
-    "show": ("print the published board", "oodd_leaderboard.commands.board:show"),
-    "place": ("show where a run would stand on it", "oodd_leaderboard.commands.board:place_run"),
+    "show": ("print the published board", "oodd_leaderboard.commands.published_board:show"),
+    "place": (
+        "show where a run would stand on it",
+        "oodd_leaderboard.commands.published_board:place_run",
+    ),
     "submit": (
         "write an entry from a results directory",
         "oodd_leaderboard.commands.entries:submit",

@@ -31,7 +31,7 @@ from oodd_eval.cli import (
 )
 from oodd_eval.cli.console import make_console
 from oodd_eval.cli.plugins import discovered
-from oodd_eval.cli.terminal import TerminalReporter
+from oodd_eval.cli.reporter import TerminalReporter
 from oodd_eval.data.bounded import read_toml
 from oodd_eval.data.files import write_text
 from oodd_eval.data.layout import log_facts

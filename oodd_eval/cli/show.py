@@ -21,7 +21,7 @@ from oodd_eval.cli import (
     together,
 )
 from oodd_eval.cli.console import make_console
-from oodd_eval.cli.terminal import TerminalReporter, summary
+from oodd_eval.cli.reporter import TerminalReporter, summary
 from oodd_eval.data.facts import ENVIRONMENTS, in_order
 from oodd_eval.data.split import Split, load_split, split_directories
 from oodd_eval.errors import UsageError

@@ -12,7 +12,7 @@ from oodd_eval.names import counted
 from oodd_eval.prose import Section, Table, terminal_text
 from oodd_eval.results import tables
 from oodd_eval.results.board import Board, boards, grouped
-from oodd_eval.results.compare import MEANINGS, By, Comparison, Difference
+from oodd_eval.results.comparison import MEANINGS, By, Comparison, Difference
 from oodd_eval.results.record import Record
 from oodd_eval.results.standings import verdict_of
 from oodd_eval.results.strengths import StrengthTables, thresholds

@@ -17,7 +17,7 @@ from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_eval.metrics.catalogue import NAMES, metric_info
 from oodd_eval.names import check_known
 from oodd_eval.prose import Table
-from oodd_eval.results.render.data import csv_rows
+from oodd_eval.results.render.tabular import csv_rows
 from oodd_paper.estimates import Estimate, Estimator, Side, lost_return
 from oodd_paper.experiments import read_tables
 from oodd_paper.inputs import Other, Returns

@@ -31,7 +31,7 @@ from oodd_eval.scoring.plan import Plan
 from oodd_eval.scoring.runner import RunOutcome, run
 from oodd_paper.experiments import EXPERIMENTS, TABLE_2, TIERS
 from oodd_paper.inputs import Other, Reproduction, keep_inputs, load_records, load_returns
-from oodd_paper.page import publish
+from oodd_paper.reproduction_page import publish
 from oodd_paper.run import Progress, duration, lay_out, scored_rows, stages, unfinished
 
 _OF_RUNS: Final = (

@@ -20,7 +20,7 @@ from oodd_eval.metrics.bootstrap import RESAMPLES, Samples, mean_samples
 from oodd_eval.results.board import contribution
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import NAN, Record
-from oodd_eval.results.render.data import number
+from oodd_eval.results.render.tabular import number
 from oodd_paper.experiments import MEAN, Experiment, Scope, Series, paper_number, scope
 from oodd_paper.inputs import KINDS, Returns
 

@@ -12,7 +12,7 @@ from oodd_eval.data.facts import ANOMALIES, TABLE1
 from oodd_eval.data.registry import Fault
 from oodd_eval.names import check_known
 from oodd_recording.faults import MAKERS, Command, Dynamics, SensorFault, choose_attributes
-from oodd_recording.info import info_of
+from oodd_recording.registered import info_of
 from oodd_recording.simulator import Simulator
 from oodd_recording.values import VALUES, choose_sensors
 

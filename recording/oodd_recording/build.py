@@ -36,14 +36,21 @@ from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import MissingExtraError, SimulationError, SplitError, UsageError
 from oodd_eval.names import check_known
 from oodd_eval.scoring.cores import available_cores
-from oodd_recording.info import MEASURED, Measured, code_digest, info_of, kinds_of, packages_of
-from oodd_recording.policies import load_policy
-from oodd_recording.record import (
+from oodd_recording.closed_loop import (
     GENERATOR_VERSION,
     RecordedEpisode,
     TwinTooShortError,
     measure,
     record_seed,
+)
+from oodd_recording.policies import load_policy
+from oodd_recording.registered import (
+    MEASURED,
+    Measured,
+    code_digest,
+    info_of,
+    kinds_of,
+    packages_of,
 )
 from oodd_recording.simulator import how_to_install
 from oodd_recording.values import bound_of, unit_of

@@ -28,16 +28,16 @@ from oodd_eval.data.registry import environment_spec
 from oodd_eval.errors import SimulationError
 from oodd_eval.metrics.threshold import isotonic
 from oodd_recording.build import workers
-from oodd_recording.info import info_of, kinds_of
-from oodd_recording.policies import load_policy
-from oodd_recording.record import (
+from oodd_recording.closed_loop import (
     GENERATOR_VERSION,
     RecordedEpisode,
     Setup,
     record_anomalous,
     return_of,
 )
-from oodd_recording.record import measure as measure_sensors
+from oodd_recording.closed_loop import measure as measure_sensors
+from oodd_recording.policies import load_policy
+from oodd_recording.registered import info_of, kinds_of
 from oodd_recording.values import bound_of, unit_of
 
 FIRST_SEED: Final = 950_000_000  # outside every split, training and the evaluation of policies

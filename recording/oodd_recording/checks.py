@@ -11,10 +11,7 @@ import numpy as np
 
 from oodd_eval.data.registry import AnomalySpec, Fault, Spec, anomaly_spec, environment_spec
 from oodd_eval.errors import OoddError, SimulationError
-from oodd_recording.faults import make_fault
-from oodd_recording.info import info_of
-from oodd_recording.policies import CustomPolicy, Policy, load_policy
-from oodd_recording.record import (
+from oodd_recording.closed_loop import (
     SHORTEST_TWIN,
     RecordedEpisode,
     Setup,
@@ -22,6 +19,9 @@ from oodd_recording.record import (
     record_anomalous,
     record_attempt,
 )
+from oodd_recording.faults import make_fault
+from oodd_recording.policies import CustomPolicy, Policy, load_policy
+from oodd_recording.registered import info_of
 from oodd_recording.simulator import Row, Simulator
 from oodd_recording.values import bound_of
 

@@ -38,10 +38,10 @@ from oodd_eval.names import Predicate, assignment, counted, select
 from oodd_recording.build import build_split
 from oodd_recording.calibrate import calibrate as find_strengths
 from oodd_recording.checks import custom_checks
-from oodd_recording.info import kinds_of
+from oodd_recording.closed_loop import evaluate_policy
 from oodd_recording.page import Page, write_page
 from oodd_recording.policies import load_policy
-from oodd_recording.record import evaluate_policy
+from oodd_recording.registered import kinds_of
 from oodd_recording.train.train import train_policy
 
 TRIED: Final = 5  # episodes in which an imported policy is tried

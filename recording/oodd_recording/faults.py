@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from oodd_eval.data.registry import AnomalySpec, Fault, anomaly_spec, environment_spec
 from oodd_eval.errors import SimulationError
-from oodd_recording.info import info_of
+from oodd_recording.registered import info_of
 from oodd_recording.simulator import Row, Simulator
 from oodd_recording.values import VALUES, choose_sensors, spread_of
 

@@ -15,10 +15,10 @@ from oodd_eval.data.files import write_bytes, write_text
 from oodd_eval.data.registry import AnomalySpec, anomaly_spec, environment_spec
 from oodd_eval.names import check_known
 from oodd_recording.calibrate import setup_of
-from oodd_recording.info import MEASURED, info_of, kinds_of
+from oodd_recording.closed_loop import record_anomalous
 from oodd_recording.pictures import frame, pictured_twin, plot
 from oodd_recording.policies import CustomPolicy
-from oodd_recording.record import record_anomalous
+from oodd_recording.registered import MEASURED, info_of, kinds_of
 from oodd_recording.values import SENSOR_SHARE, bound_of, spread_of, unit_of
 
 PICTURED: Final = ("kept75", "loss25")

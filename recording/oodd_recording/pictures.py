@@ -12,9 +12,9 @@ from typing import Final
 import numpy as np
 
 from oodd_eval.errors import SimulationError
+from oodd_recording.closed_loop import SHORTEST_TWIN, RecordedEpisode, Setup
 from oodd_recording.environments import make
-from oodd_recording.info import MEASURED, info_of
-from oodd_recording.record import SHORTEST_TWIN, RecordedEpisode, Setup
+from oodd_recording.registered import MEASURED, info_of
 from oodd_recording.simulator import Image, quiet_streams
 from oodd_recording.svg import INK, label, svg
 from oodd_recording.values import spread_of

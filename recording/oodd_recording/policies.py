@@ -17,8 +17,8 @@ from oodd_eval.data.facts import EnvironmentInfo
 from oodd_eval.data.layout import content_digest
 from oodd_eval.data.registry import environment_spec
 from oodd_eval.errors import PolicyError
-from oodd_recording.info import code_digest, info_of
 from oodd_recording.mlp import Layers
+from oodd_recording.registered import code_digest, info_of
 
 ACTION_GRID: Final = 2.0**16
 LAYERS: Final = {

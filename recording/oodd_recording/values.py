@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oodd_eval.data.registry import anomaly_spec
-from oodd_recording.info import MEASURED, Measured, info_of
+from oodd_recording.registered import MEASURED, Measured, info_of
 
 SENSOR_SHARE: Final = 0.2  # of the sensors that an anomaly corrupts, rounded down, at least one
 

@@ -9,7 +9,7 @@ from helpers_plugins import install
 from oodd_checks.pytest_cells import Cells, Regression
 
 from oodd_eval import evaluate
-from oodd_eval.results.compare import read_record_set, write_reference
+from oodd_eval.results.comparison import read_record_set, write_reference
 from oodd_eval.results.record import Metric
 
 pytest_plugins = ["pytester"]

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from oodd_eval.cli import main as cli
 from oodd_eval.errors import UsageError
 from oodd_eval.metrics.catalogue import NAMES
-from oodd_eval.results.compare import (
+from oodd_eval.results.comparison import (
     NothingInCommonError,
     RecordSet,
     Tolerance,
@@ -24,7 +24,7 @@ from oodd_eval.results.compare import (
     write_reference,
 )
 from oodd_eval.results.record import Metric, same_terms
-from oodd_eval.results.render.data import junit
+from oodd_eval.results.render.tabular import junit
 from oodd_eval.results.render.text import markdown_section
 from oodd_eval.results.report import change, comparison_section
 

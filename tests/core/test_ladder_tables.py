@@ -8,7 +8,7 @@ import pytest
 from helpers_records import example, make_record
 from rich.console import Console
 
-from oodd_eval.cli.terminal import TerminalReporter
+from oodd_eval.cli.reporter import TerminalReporter
 from oodd_eval.data.condition import Rung
 from oodd_eval.errors import SplitError
 from oodd_eval.metrics.catalogue import UNDEFINED

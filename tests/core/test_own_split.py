@@ -9,14 +9,14 @@ from helpers_split import make_group, make_split
 from oodd_eval import evaluate, load_split
 from oodd_eval.cli.main import main
 from oodd_eval.data.condition import Condition, in_suite_order
+from oodd_eval.data.description import describe
 from oodd_eval.data.facts import ENVIRONMENTS, Quantity, in_order
 from oodd_eval.data.fetch import fetch
-from oodd_eval.data.info import describe
 from oodd_eval.data.layout import MANIFEST, own_facts, write_environment, write_manifest
 from oodd_eval.errors import SplitError, UsageError
 from oodd_eval.results import tables
 from oodd_eval.results.board import boards
-from oodd_eval.results.compare import read_record_set, write_reference
+from oodd_eval.results.comparison import read_record_set, write_reference
 from oodd_eval.results.tables import Tables
 
 OWN = {"slip": "dynamics", "fog": "sensor"}

@@ -15,14 +15,14 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from oodd_eval.cli.main import main
-from oodd_eval.cli.terminal import TerminalReporter
+from oodd_eval.cli.reporter import TerminalReporter
 from oodd_eval.metrics.bootstrap import bounds, drawn_cell, sample_cells
 from oodd_eval.metrics.catalogue import PAPER
 from oodd_eval.metrics.recalibration import PairedScores
 from oodd_eval.prose import Table, print_prose, print_table
 from oodd_eval.results import tables
 from oodd_eval.results.board import Board, boards, contribution
-from oodd_eval.results.compare import write_reference
+from oodd_eval.results.comparison import write_reference
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.evaluate import Rules, cell_metrics
 from oodd_eval.results.render import FORMATS

@@ -13,8 +13,8 @@ from helpers_logs import UNPAIRED, log_parts, make_log_split, write_log_split
 from helpers_split import make_group
 
 from oodd_eval.cli.main import main
+from oodd_eval.data.description import collect_returns, describe, group_rows, log_rows, return_rows
 from oodd_eval.data.facts import ENVIRONMENTS, LICENCE, SPLITS, TABLE1, LogFacts
-from oodd_eval.data.info import collect_returns, describe, group_rows, log_rows, return_rows
 from oodd_eval.data.layout import read_manifest, write_environment, write_manifest
 from oodd_eval.data.parts import NOMINAL
 from oodd_eval.data.split import load_split

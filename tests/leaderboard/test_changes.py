@@ -4,7 +4,7 @@ import shutil
 import subprocess
 
 import pytest
-from oodd_leaderboard import build as leaderboard_build
+from oodd_leaderboard import pages as leaderboard_build
 from oodd_leaderboard.commands.entries import changes_against
 from oodd_leaderboard.submit import Statement, submit
 

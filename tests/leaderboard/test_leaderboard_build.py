@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from helpers_records import PAIRED, example, make_record
 from helpers_site import submitted as entry
-from oodd_leaderboard import build as leaderboard_build
-from oodd_leaderboard.build import cells, page
+from oodd_leaderboard import pages as leaderboard_build
 from oodd_leaderboard.entry import REPORTED, read_entries, sections
+from oodd_leaderboard.pages import cells, page
 from oodd_leaderboard.published import PUBLISHED
 
 from oodd_eval.cli.main import main
@@ -29,7 +29,7 @@ from oodd_eval.results.board import Board, expected_cells
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Metric
-from oodd_eval.results.render.data import comparisons_csv, number, ranking_csv
+from oodd_eval.results.render.tabular import comparisons_csv, number, ranking_csv
 from oodd_eval.results.standings import cost_of, primary_settings, ranked
 
 SEEDS = 12

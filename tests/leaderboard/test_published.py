@@ -10,7 +10,7 @@ import pytest
 from helpers_records import make_record
 from helpers_site import submitted
 from oodd_leaderboard import published
-from oodd_leaderboard.commands import board as board_command
+from oodd_leaderboard.commands import published_board as board_command
 from oodd_leaderboard.entry import REPORTED, SuiteSection, sections
 from oodd_leaderboard.published import (
     board_of,

@@ -10,7 +10,7 @@ import pytest
 from oodd_leaderboard import site
 from oodd_leaderboard.curve_file import read_curves
 from oodd_leaderboard.entry import REPORTED, read_entries, sections
-from oodd_leaderboard.site.data import (
+from oodd_leaderboard.site.content import (
     WITH_INTERVALS,
     gridded,
     part_name,

@@ -9,7 +9,7 @@ import pytest
 from oodd_leaderboard import site
 from oodd_leaderboard.curve_file import read_curves
 from oodd_leaderboard.entry import REPORTED, read_entries, sections
-from oodd_leaderboard.site.data import site_data
+from oodd_leaderboard.site.content import site_data
 
 from oodd_eval.data.facts import ANOMALIES
 from oodd_eval.metrics.catalogue import METRICS

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 from helpers_submission import Draft, assert_refused
 from oodd_leaderboard.verify import records as checks
-from oodd_leaderboard.verify.files import MOST_PROBLEMS, Findings
+from oodd_leaderboard.verify.entry_files import MOST_PROBLEMS, Findings
 
 from oodd_eval.metrics import catalogue
 from oodd_eval.results.record import Record

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from helpers_records import make_record
 from oodd_paper.claims import changed, rulings
+from oodd_paper.dot_plots import pictures_of
 from oodd_paper.estimates import Estimate, Estimator, Side, compute
 from oodd_paper.experiments import (
     EXPERIMENTS,
@@ -28,7 +29,7 @@ from oodd_paper.inputs import (
     dump_returns,
     load_returns,
 )
-from oodd_paper.page import (
+from oodd_paper.reproduction_page import (
     caption,
     layout,
     numbers_csv,
@@ -37,7 +38,6 @@ from oodd_paper.page import (
     returns_tables,
     show,
 )
-from oodd_paper.pictures import pictures_of
 from oodd_paper.run import COSTS
 
 from oodd_eval.data.facts import ENVIRONMENTS, TABLE1

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers_reproduce import install_quick
-from oodd_paper import page as pages
+from oodd_paper import reproduction_page as pages
+from oodd_paper.dot_plots import Dots, Panel, Picture, draw, drawing_key
 from oodd_paper.experiments import Grid
-from oodd_paper.pictures import Dots, Panel, Picture, draw, drawing_key
 
 from oodd_eval.cli.main import main
 from oodd_eval.results.directory import ResultsDirectory

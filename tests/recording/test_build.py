@@ -12,8 +12,8 @@ pytest.importorskip("gymnasium")
 from oodd_recording import build
 from oodd_recording.benchmark import FROZEN
 from oodd_recording.build import Chunk, build_split, digest_of_bits, seed_of
+from oodd_recording.closed_loop import TwinTooShortError, record_seed
 from oodd_recording.policies import load_policy
-from oodd_recording.record import TwinTooShortError, record_seed
 from oodd_recording.train.freeze import freeze_policy
 
 from oodd_eval.data.condition import Condition

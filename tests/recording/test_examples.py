@@ -78,8 +78,8 @@ def swimmer(monkeypatch):
 
 def test_the_swimmer_swims_and_passes_its_checks(swimmer):
     from oodd_recording.checks import custom_checks
+    from oodd_recording.closed_loop import evaluate_policy
     from oodd_recording.policies import load_policy
-    from oodd_recording.record import evaluate_policy
 
     assert evaluate_policy("swimmer", load_policy("swimmer"), episodes=3).min() > 60
     for spec in swimmer:

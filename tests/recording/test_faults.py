@@ -10,10 +10,10 @@ import pytest
 from helpers_simulate import Reflex
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from oodd_recording.closed_loop import Setup, record_anomalous, record_seed
 from oodd_recording.environments import make
 from oodd_recording.faults import make_fault
 from oodd_recording.policies import load_policy
-from oodd_recording.record import Setup, record_anomalous, record_seed
 from oodd_recording.values import VALUES, bound_of, spread_of
 
 from oodd_eval.data.condition import Condition
@@ -342,7 +342,7 @@ def test_noise_of_nominal_operation_is_that_of_the_twin_and_has_the_stated_devia
 
 
 def faults_of_noise(setup):
-    from oodd_recording.record import _noise
+    from oodd_recording.closed_loop import _noise
 
     add = _noise(setup, 7)
     return np.array([add(np.zeros(4, np.float32)) for _ in range(2000)]) / spread_of("cartpole")

@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("gymnasium", reason="needs the extra gym")
 from helpers_own import BASIN, CISTERN, forget_own
 from helpers_plugins import install
-from oodd_recording.info import code_digest
+from oodd_recording.registered import code_digest
 
 from oodd_eval import load_split
 from oodd_eval.cli.main import main

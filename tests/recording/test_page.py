@@ -11,8 +11,8 @@ from helpers_docs import ROOT
 from helpers_own import BASIN, forget_own
 from helpers_plugins import install
 from oodd_recording import pictures
+from oodd_recording.closed_loop import RecordedEpisode
 from oodd_recording.environments import make
-from oodd_recording.record import RecordedEpisode
 
 from oodd_eval.cli.main import main
 from oodd_eval.data.condition import Rung

@@ -13,11 +13,11 @@ import gymnasium
 from helpers_own import CISTERN, forget_own
 from helpers_plugins import install
 from oodd_recording.checks import Blinking
+from oodd_recording.closed_loop import Setup, measure, record_anomalous, record_attempt
 from oodd_recording.environments import make
 from oodd_recording.faults import Scheduled, SensorFault, make_fault
-from oodd_recording.info import code_digest, info_of
 from oodd_recording.policies import CustomPolicy, load_policy, scaled
-from oodd_recording.record import Setup, measure, record_anomalous, record_attempt
+from oodd_recording.registered import code_digest, info_of
 from oodd_recording.values import choose_sensors, spread_of
 
 from oodd_eval import AnomalySpec, EnvironmentSpec, Fault, Quantity, load_split
@@ -446,7 +446,7 @@ from oodd_eval.data.registry import register
 from {package} import oodd_anomalies, oodd_environments
 register([*oodd_environments(), *oodd_anomalies()])
 from oodd_recording.policies import load_policy
-from oodd_recording.record import record_nominal
+from oodd_recording.closed_loop import record_nominal
 record_nominal("{environment}", 1, policy=load_policy("{environment}"), episode_cap=60)
 others = {{"pybullet", "pybullet_envs_gymnasium", "Box2D", "mujoco"}} & set(sys.modules)
 sys.exit(f"imported {{others}}" if others else 0)

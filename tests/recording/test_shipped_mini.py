@@ -11,8 +11,8 @@ from gymnasium.envs.box2d import lunar_lander
 from gymnasium.envs.classic_control.acrobot import AcrobotEnv
 from gymnasium.envs.classic_control.cartpole import CartPoleEnv
 from oodd_recording.anomalies import VALUES
+from oodd_recording.closed_loop import record_seed
 from oodd_recording.policies import load_policy
-from oodd_recording.record import record_seed
 from pybullet_envs_gymnasium import gym_locomotion_envs
 
 from oodd_eval.data.condition import Condition

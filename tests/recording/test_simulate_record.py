@@ -5,10 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from helpers_simulate import Reflex, record
-from oodd_recording import record as recording
+from oodd_recording import closed_loop as recording
+from oodd_recording.closed_loop import TwinTooShortError, record_nominal
 from oodd_recording.environments import make
 from oodd_recording.faults import Fault
-from oodd_recording.record import TwinTooShortError, record_nominal
 
 from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_eval.data.trajectory import Trajectory

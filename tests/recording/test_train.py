@@ -16,7 +16,7 @@ pytest.importorskip("gymnasium")
 record, freeze, iqn, td3, train = (
     pytest.importorskip(name)
     for name in (
-        "oodd_recording.record",
+        "oodd_recording.closed_loop",
         *(f"oodd_recording.train.{module}" for module in ("freeze", "iqn", "td3", "train")),
     )
 )

@@ -10,10 +10,10 @@ import pytest
 pytest.importorskip("mujoco", reason="needs the extra worlds")
 from helpers_own import forget_own
 from oodd_recording.calibrate import loss_of
+from oodd_recording.closed_loop import Setup, record_anomalous, record_seed
 from oodd_recording.environments import make
 from oodd_recording.faults import make_fault
 from oodd_recording.policies import load_policy
-from oodd_recording.record import Setup, record_anomalous, record_seed
 from oodd_recording.values import bound_of
 from oodd_worlds import KINDS, ROWS, oodd_anomalies, oodd_environments
 from oodd_worlds.arm import WORLD as ARM

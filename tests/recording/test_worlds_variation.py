@@ -10,9 +10,9 @@ import pytest
 pytest.importorskip("mujoco", reason="needs the extra worlds")
 from helpers_own import forget_own
 from oodd_recording.build import build_split
+from oodd_recording.closed_loop import Setup, record_anomalous
 from oodd_recording.environments import make
 from oodd_recording.policies import load_policy
-from oodd_recording.record import Setup, record_anomalous
 from oodd_worlds import oodd_anomalies, oodd_environments
 from oodd_worlds.facts import read_world
 

@@ -10,7 +10,7 @@ from oodd_eval import load_split
 from oodd_eval.data.facts import ENVIRONMENTS, PROTOCOL, TABLE1
 from oodd_eval.names import expression
 from oodd_eval.results.board import Conditions
-from oodd_eval.results.compare import MEANINGS, read_record_set, write_reference
+from oodd_eval.results.comparison import MEANINGS, read_record_set, write_reference
 
 ROOT = Path(__file__).parents[2]
 DOCUMENT = (ROOT / "docs/regression-checks.md").read_text()

@@ -30,7 +30,7 @@ from oodd_eval.plugins.isolation import ChannelClosedError, ChannelGarbledError
 from oodd_eval.plugins.isolation.child import Child, GivenUpError, Launcher, Limits
 from oodd_eval.plugins.isolation.worker import connect
 from oodd_eval.plugins.specs import MOST_SPECS, is_line
-from oodd_leaderboard.sandbox.specs import description_of, spec_of
+from oodd_leaderboard.sandbox.described_specs import description_of, spec_of
 
 if TYPE_CHECKING:
     from oodd_eval.data.registry import Spec

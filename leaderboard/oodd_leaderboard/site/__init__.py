@@ -3,7 +3,7 @@
 The page holds styles, scripts and the index of all rows. Its content security policy allows that
 style and script, by digest, and scripts beside the page: the data files, loaded when needed. Each
 calls one function with its name and its content as JSON text. What they hold is computed in
-`oodd_leaderboard.site.data`.
+`oodd_leaderboard.site.content`.
 """
 
 import base64
@@ -16,7 +16,7 @@ from typing import Any, Final
 
 from oodd_eval._version import __version__
 from oodd_leaderboard.entry import REPORTED, LeaderboardSection, SuiteSection
-from oodd_leaderboard.site.data import Json, site_data
+from oodd_leaderboard.site.content import Json, site_data
 
 PAGE: Final = "index.html"
 PARTS: Final = "data"  # directory of the data files

@@ -30,7 +30,7 @@ from oodd_leaderboard.entry import (
     recorded_versions,
     row_of,
 )
-from oodd_leaderboard.verify.files import (
+from oodd_leaderboard.verify.entry_files import (
     Findings,
     check_digests,
     find_text,

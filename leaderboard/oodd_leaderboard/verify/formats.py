@@ -20,7 +20,7 @@ from oodd_eval.results import record as record_format
 from oodd_eval.results.directory import RECORDS
 from oodd_eval.results.record import Record
 from oodd_leaderboard.entry import ENTRY, SCHEMA, EntryInfo
-from oodd_leaderboard.verify.files import (
+from oodd_leaderboard.verify.entry_files import (
     MB,
     MOST_FILES,
     Findings,

@@ -19,7 +19,7 @@ from oodd_eval.results.directory import RECORDS
 from oodd_eval.results.evaluate import early_difference
 from oodd_eval.results.record import Record
 from oodd_leaderboard.entry import EntryInfo
-from oodd_leaderboard.verify.files import Findings, plain, short
+from oodd_leaderboard.verify.entry_files import Findings, plain, short
 
 Records = Mapping[str, Record]  # records by their line: ``records.jsonl:3 (<cell>)``
 TOLERANCE: Final = 1e-12  # relative and absolute: processors take sums in different orders

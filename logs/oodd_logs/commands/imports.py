@@ -14,7 +14,7 @@ from oodd_eval.errors import UsageError
 from oodd_eval.names import assignment
 from oodd_eval.prose import print_prose
 from oodd_eval.scoring.promises import promises_of
-from oodd_logs.commands.formats import register_formats
+from oodd_logs.commands.reader_plugins import register_formats
 from oodd_logs.importing import import_data, import_recipe
 from oodd_logs.readers import quantity
 from oodd_logs.recipe import Recipe

@@ -11,7 +11,7 @@ from oodd_eval.cli.console import make_console
 from oodd_eval.data.files import write_text
 from oodd_eval.errors import OutputError
 from oodd_eval.prose import print_prose
-from oodd_logs.commands.formats import register_formats
+from oodd_logs.commands.reader_plugins import register_formats
 from oodd_logs.inspection.draft import draft
 from oodd_logs.inspection.logs import Inspection, inspect_logs
 from oodd_logs.inspection.meaning import sensors_of, window_of

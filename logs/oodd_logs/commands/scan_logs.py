@@ -17,7 +17,7 @@ from oodd_eval.data.files import write_text
 from oodd_eval.names import counted
 from oodd_eval.plugins.parameters import parameters_by_detector
 from oodd_eval.prose import print_prose
-from oodd_logs.commands.formats import register_formats
+from oodd_logs.commands.reader_plugins import register_formats
 from oodd_logs.recipe import Recipe
 from oodd_logs.scanning.logs import read_logs
 from oodd_logs.scanning.scan import SCANNER, Scan, ScannedEpisode, scan_episodes

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_eval.data.files import replacing, write_text
 from oodd_recording.benchmark import FROZEN
-from oodd_recording.info import info_of
+from oodd_recording.closed_loop import EVALUATION_SEED, evaluate_policy
 from oodd_recording.policies import LAYERS, Arrays, load_policy, make_policy, policy_digest
-from oodd_recording.record import EVALUATION_SEED, evaluate_policy
+from oodd_recording.registered import info_of
 
 
 def freeze_policy(

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from oodd_recording.environments import make
-from oodd_recording.info import info_of
+from oodd_recording.registered import info_of
 from oodd_recording.train.replay import Replay
 
 HYPER_PARAMETERS: dict[str, Any] = {

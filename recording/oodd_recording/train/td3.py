@@ -24,8 +24,8 @@ from torch import Tensor
 from torch.nn import functional
 
 from oodd_recording.environments import make
-from oodd_recording.info import info_of
 from oodd_recording.policies import LAYERS, scaled
+from oodd_recording.registered import info_of
 from oodd_recording.train.replay import Replay
 
 HYPER_PARAMETERS: dict[str, Any] = {

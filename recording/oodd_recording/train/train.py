@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from oodd_eval.data.files import replacing, write_text
 from oodd_eval.errors import MissingExtraError, PolicyError
-from oodd_recording.info import info_of
+from oodd_recording.closed_loop import evaluate_policy
 from oodd_recording.policies import load_policy
-from oodd_recording.record import evaluate_policy
+from oodd_recording.registered import info_of
 from oodd_recording.train.freeze import freeze_policy
 
 SELECTION_SEED: Final = 910_000_000

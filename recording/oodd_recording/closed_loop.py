@@ -24,8 +24,8 @@ from oodd_eval.names import check_known
 from oodd_recording.anomalies import draw
 from oodd_recording.environments import make
 from oodd_recording.faults import make_fault
-from oodd_recording.info import MEASURED, Measured, info_of, kinds_of
 from oodd_recording.policies import CustomPolicy, Policy
+from oodd_recording.registered import MEASURED, Measured, info_of, kinds_of
 from oodd_recording.simulator import Simulator
 from oodd_recording.values import spread_of
 

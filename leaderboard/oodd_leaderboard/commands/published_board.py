@@ -22,7 +22,7 @@ from oodd_eval.results.board import boards, grouped
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
-from oodd_eval.results.render.data import ranking_csv
+from oodd_eval.results.render.tabular import ranking_csv
 from oodd_eval.results.render.text import markdown_section
 from oodd_eval.results.standings import Standing
 from oodd_leaderboard.entry import ENTRY, REPORTED, read_entry

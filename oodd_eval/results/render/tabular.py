@@ -12,7 +12,7 @@ from xml.etree import ElementTree as ET
 from oodd_eval.data.bounded import without_nan
 from oodd_eval.metrics.catalogue import NAMES
 from oodd_eval.results.board import Value
-from oodd_eval.results.compare import MEANINGS, Comparison, Difference
+from oodd_eval.results.comparison import MEANINGS, Comparison, Difference
 from oodd_eval.results.record import NAN, Metric, Record
 from oodd_eval.results.render import renders
 from oodd_eval.results.report import Report, by_suite, flat, message

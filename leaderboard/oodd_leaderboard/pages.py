@@ -19,7 +19,7 @@ from oodd_eval.prose import Section, Table
 from oodd_eval.results import tables
 from oodd_eval.results.board import Board
 from oodd_eval.results.record import Record
-from oodd_eval.results.render.data import cells_csv, comparisons_csv, ranking_csv
+from oodd_eval.results.render.tabular import cells_csv, comparisons_csv, ranking_csv
 from oodd_eval.results.render.text import escape, markdown_body, markdown_list, markdown_table
 from oodd_eval.results.report import findings_of
 from oodd_eval.results.standings import RankedBoard, primary_settings, verdict_of

@@ -24,13 +24,13 @@ from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS, TABLE1, paper_
 from oodd_eval.metrics.catalogue import metric_info
 from oodd_eval.prose import Table
 from oodd_eval.results.record import Record
-from oodd_eval.results.render.data import csv_rows, number
+from oodd_eval.results.render.tabular import csv_rows, number
 from oodd_eval.results.render.text import markdown_table as padded_table
 from oodd_paper.claims import NOT_RUN, Ruling, changed, claims_csv, claims_table, rulings, summary
+from oodd_paper.dot_plots import Picture, draw, drawing_key, pictures_of, returns_picture
 from oodd_paper.estimates import Estimate, Estimator, Numbers, TableNumber, compute, mean_return
 from oodd_paper.experiments import EXPERIMENTS, TABLE_2, Experiment
 from oodd_paper.inputs import KINDS, Other, Reproduction, Returns, write_changed
-from oodd_paper.pictures import Picture, draw, drawing_key, pictures_of, returns_picture
 
 TEXTS: Final = tomllib.loads(Path(__file__).with_name("page.toml").read_text(encoding="utf-8"))
 
