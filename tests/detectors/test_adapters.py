@@ -436,7 +436,7 @@ def test_adapters_are_submitted_and_verified_without_a_look_at_the_class(
     ]  # fmt: skip
     assert main(command) == 0
     submit = ["leaderboard", "submit", str(tmp_path / "out"), "--split", str(tiny_split)]
-    assert main([*submit, "--scores", "--results", str(tmp_path / "entries")]) == 0
+    assert main([*submit, "--results", str(tmp_path / "entries")]) == 0
     # Results are data: verifying them imports nothing that they name.
     theirs.write_text("raise SystemExit('imported')")
     sys.modules.pop("their_models", None)
