@@ -6,11 +6,10 @@ Each recording is read once, and its rows wait on disk, in float64, until a part
 import dataclasses
 import glob
 import itertools
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +35,7 @@ from oodd_logs.selecting import (
     named_columns,
     select_columns,
 )
-from oodd_logs.stamps import Steps, Stretch, Times, even_rate
+from oodd_logs.stamps import Steps, Times, even_rate
 
 EVERY: Final = "every"
 """The part with all episodes of a source that `read_every_episode` made."""
@@ -253,16 +252,17 @@ def make_episodes(
     intervals
         Anomalous rows by file.
     """
-    return _filled(_Maker(recipe, intervals), recordings)
+    return _read(_Reading(recipe, intervals), recordings)
 
 
-def _filled(maker: "_Maker", recordings: Iterable[Recorded]) -> EpisodeSource:
+def _read(reading: "_Reading", recordings: Iterable[Recorded]) -> EpisodeSource:
     try:
         for recorded in recordings:
-            maker.add(recorded)
-        return maker.finish()
+            _add(reading, recorded)
+        return _every_episode(reading) if reading.every else _in_parts(reading)
     except BaseException:
-        maker.close()
+        if reading.first:
+            reading.first.spool.close()
         raise
 
 
@@ -307,7 +307,7 @@ def read_every_episode(recipe: Recipe, root: Path, files: Sequence[Path]) -> Epi
         for roles in [listed.get(path, {FILES})]
         for recording in reader_for(path, recipe.format).read(path, recipe.options)
     )
-    return _filled(_EveryMaker(recipe, IntervalList.of(recipe, root)), recordings)
+    return _read(_Reading(recipe, IntervalList.of(recipe, root), every=True), recordings)
 
 
 def matching_files(patterns: Sequence[str], root: Path) -> list[Path]:
@@ -376,404 +376,8 @@ def names_matching(pattern: str, root: Path) -> list[str]:
     return glob.glob(pattern, root_dir=root, recursive=True)  # noqa: PTH207
 
 
-class _Maker:
-    """Takes recordings one at a time and makes episodes of them."""
-
-    def __init__(self, recipe: Recipe, intervals: IntervalList) -> None:
-        self._recipe, self._intervals = recipe, intervals
-        self._tally = Tally()
-        self._left_out: Counter[str] = Counter()
-        self._selections: dict[Layout, tuple[Selection, _Base]] = {}
-        self._parts: dict[str, list[EpisodeFacts]] = {}
-        self._spans: list[tuple[float, float]] = []  # first and last stamps of recordings
-        self._steps: list[Steps] = []
-        self._recordings = 0
-        self._names: set[str] = set()
-        self._problems: list[str] = []
-        self._cut_by_outcome: set[str] = set()  # parts with windows that no label is of
-        self._base: _Base | None = None
-
-    def close(self) -> None:
-        """Remove what was kept."""
-        if self._base:
-            self._base.spool.close()
-
-    # One recording
-
-    def add(self, recorded: Recorded) -> None:
-        """Read one recording and keep its episodes."""
-        recorded = recorded.meeting(self._recipe)
-        if not recorded.roles:
-            self._left_out["recording(s) that meet no condition (where)"] += 1
-            return
-        recording, layout = recorded.recording, layout_of(recorded.recording)
-        if layout not in self._selections:
-            chosen = self._select(layout, recording)
-            base = self._base = self._base or _Base.of(recording, chosen, self._recipe)
-            self._selections[layout] = base.in_order(chosen, recording), base
-        selection, base = self._selections[layout]
-        if (choices := _choices(recording)) != base.choices:
-            raise TrajectoryError(
-                f"{recording.source}: its actions are {choices}, expected {base.choices} as in "
-                f"{base.source}"
-            )
-        self._recordings += 1
-        self._names |= {recorded.relative, recording.name}
-        outcome = self._outcome(recorded)
-        kind = self._kind_of(recorded, outcome)
-        task = self._value(recorded, self._recipe.task) or ""
-        taken = StampedRows(recorded, selection, self._recipe, self._tally)
-        is_anomalous = bool(kind or recorded.kinds)
-        marks = taken.marks(self._intervals, is_anomalous=is_anomalous)
-        stretches, times = taken.stretches()
-        if times:
-            self._spans.append((min(t[0] for t in times), max(t[-1] for t in times)))
-            self._steps += [steps for t in times if (steps := Steps.of(t)).usual]
-        count = 0
-        for stretch in stretches:
-            first = base.spool.rows
-            spool_stretch(base.spool, stretch, taken.topics, base.converter, recording.source)
-            rows = rows_of(marks, stretch.positions, stretch.tolerance)
-            is_cut = len(stretches) > 1
-            for part, start, stop, inside, is_piece in self._cut(
-                recorded, kind, stretch.rows, rows, is_cut=is_cut
-            ):
-                name = f"{recording.name}#{count}" if is_piece else recording.name
-                count += 1
-                self._keep(
-                    EpisodeFacts(
-                        part,
-                        name,
-                        recording.source,
-                        first + start,
-                        stop - start,
-                        () if part in NOMINAL_ROLES else merged(inside),
-                        outcome,
-                        task,
-                        *_times(stretch, start, stop),
-                        recording.fields,
-                    )
-                )
-
-    def _select(self, layout: Layout, recording: Recording) -> Selection:
-        try:
-            return select_columns(layout, self._recipe, recording.source)
-        except UnknownNameError as error:
-            if self._base is None:
-                raise
-            raise TrajectoryError(f"{error}; {self._base.source} has it") from None
-
-    def _cut(
-        self,
-        recorded: Recorded,
-        kind: str,
-        total: int,
-        rows: Sequence[AnomalousRows],
-        *,
-        is_cut: bool,
-    ) -> Iterator[tuple[str, int, int, Sequence[AnomalousRows], bool]]:
-        """Yield part, rows and anomalous rows of the episodes of a stretch, and if it was cut."""
-        for window, roles in self._windows(recorded).items():
-            has_windows = 0 < window < total
-            is_piece = has_windows or is_cut
-            length = window if has_windows else total
-            for start in range(0, total, length):
-                stop = min(start + length, total)
-                inside = _clipped(rows, start, stop)
-                parts = self._targets(recorded, roles, kind, inside, is_piece=is_piece)
-                if stop - start < length and self._takes_whole_windows(parts, inside):
-                    self._left_out["row(s) at ends of recordings, less than a window"] += (
-                        stop - start
-                    )
-                elif stop - start < max(2, self._recipe.baseline + 1):
-                    self._refuse_short(recorded.recording, stop - start, is_piece=is_piece)
-                else:
-                    if has_windows and not inside:
-                        self._cut_by_outcome |= {*parts} - NOMINAL_ROLES
-                    yield from ((part, start, stop, inside, is_piece) for part in parts)
-
-    def _takes_whole_windows(self, parts: Sequence[str], inside: Sequence[AnomalousRows]) -> bool:
-        """Whether a short last window is dropped (labelled ones are kept)."""
-        return bool(NOMINAL_ROLES & {*parts} or (parts and not inside))
-
-    def _windows(self, recorded: Recorded) -> dict[int, set[str]]:
-        """Return the roles of a recording by the length of their windows."""
-        windows: dict[int, set[str]] = {}
-        for role in sorted(recorded.roles):
-            tables = self._recipe.anomalous
-            is_nominal = role in NOMINAL_ROLES
-            table = self._recipe.nominal if is_nominal else tables[role.removeprefix("test/")]
-            length = self._recipe.window if table.window is None else table.window
-            windows.setdefault(length, set()).add(role)
-        return windows
-
-    def _targets(
-        self,
-        recorded: Recorded,
-        roles: set[str],
-        kind: str,
-        inside: Sequence[AnomalousRows],
-        *,
-        is_piece: bool,
-    ) -> list[str]:
-        """Return the parts that an episode of a recording belongs to."""
-        source, recipe = recorded.source, self._recipe
-        nominal = sorted(roles & NOMINAL_ROLES)
-        kinds = {role.removeprefix("test/") for role in roles - NOMINAL_ROLES}
-        if kind:
-            return [f"test/{kind}"]
-        if recipe.kinds or recipe.outcome:
-            self._left_out["nominal recording(s) in files of an anomaly alone"] += not nominal
-            return nominal
-        labelled = {name for *_, name in inside}
-        # Intervals may name an anomaly that has no files of its own.
-        kinds |= {n for n in labelled if n and not recipe.anomalous.get(n, _NO_FILES).files}
-        if not inside:
-            if nominal:
-                return nominal
-            if recipe.paired or not any(self._says_rows(name) for name in kinds):
-                return [f"test/{name}" for name in sorted(kinds)]
-            if is_piece:
-                self._left_out["window(s) of anomalous recordings without an anomalous row"] += 1
-                return []
-            # Raised at the end, as the names in a list of intervals may be wrong.
-            self._problems.append(
-                f"{source} has no anomalous row by its labels, expected some as it is listed under "
-                f"{', '.join(sorted(kinds))}: leave it out, or list it under [nominal]"
-            )
-            return []
-        matching = [f"test/{name}" for name in sorted(kinds) if labelled & {"", name}]
-        if not matching and nominal and not is_piece:
-            start, stop, _ = inside[0]
-            raise TrajectoryError(
-                f"{source} is listed as nominal, but is anomalous in rows {max(start, 0)} to "
-                f"{stop - 1}: list it under [anomalous.NAME], or cut it with window, so that the "
-                "windows without anomalous rows are nominal; labels of nominal rows other than 0, "
-                "false, H or nothing are named by nominal_label"
-            )
-        self._left_out["window(s) with anomalous rows, of nominal files"] += not matching
-        return matching
-
-    def _says_rows(self, kind: str) -> bool:
-        """Tell whether the recipe says which rows of an anomaly are anomalous."""
-        recipe, table = self._recipe, self._recipe.anomalous.get(kind, _NO_FILES)
-        onset = recipe.onset if table.onset is None else table.onset
-        return bool(recipe.labels or table.labels or self._intervals or onset is not None)
-
-    def _value(self, recorded: Recorded, name: str, *, last: bool = False) -> str | None:
-        """Return the value of a field or column; None where the recipe names none."""
-        return recorded.text(name, last=last) if name else None
-
-    def _kind_of(self, recorded: Recorded, outcome: bool | None) -> str:
-        """Return the anomaly that a field or the outcome names; empty for a nominal recording."""
-        recipe = self._recipe
-        text = self._value(recorded, recipe.kinds)
-        if text is not None:
-            nominal = map(text_of, recipe.nominal.where.get(recipe.kinds, ()))
-            return "" if text in nominal else anomaly_name(text)
-        if outcome is False:
-            fallback = [name for name, table in recipe.anomalous.items() if not table.files]
-            return next(iter([*recorded.kinds, *fallback]), FAILURE)
-        return ""
-
-    def _outcome(self, recorded: Recorded) -> bool | None:
-        text = self._value(recorded, self._recipe.outcome, last=True)
-        if text is None:
-            return None
-        text = text.lower()
-        if text not in _TRUE | _FALSE:
-            raise TrajectoryError(
-                f"{recorded.source}: {self._recipe.outcome} is {text!r}, expected true or false"
-            )
-        return text in _TRUE
-
-    def _refuse_short(self, recording: Recording, rows: int, *, is_piece: bool) -> None:
-        least = max(2, self._recipe.baseline + 1)
-        if not is_piece:
-            why = ", more than the baseline" if least > 2 else ""
-            logged = max(topic.rows for topic in recording.topics.values())
-            if self._recipe.rate and logged >= least:
-                why += (
-                    f"; {logged} rows were logged: are rate = {self._recipe.rate:g} and the unit "
-                    "of the stamps right, as in time = 'NAME[ms]'?"
-                )
-            raise TrajectoryError(
-                f"{recording.source} has {counted(rows, 'observation(s)')}, expected at least "
-                f"{least}{why}"
-            )
-        self._left_out[f"piece(s) shorter than {least} rows"] += 1
-
-    def _keep(self, facts: EpisodeFacts) -> None:
-        baseline = self._recipe.baseline
-        if early := [start for start, _ in facts.intervals if 0 <= start < baseline]:
-            if "#" not in facts.name:
-                raise TrajectoryError(
-                    f"{facts.source} is anomalous from row {early[0]} on, expected its first "
-                    f"{baseline} rows (baseline) to be nominal"
-                )
-            self._left_out["window(s) that are anomalous within their baseline"] += 1
-            return
-        episodes = self._parts.setdefault(facts.part, [])
-        if len(episodes) == EPISODES:
-            raise UsageError(f"{facts.part} has more than {EPISODES} episodes, the most there are")
-        episodes.append(facts)
-
-    # All of them
-
-    def finish(self) -> EpisodeSource:
-        """Return all episodes, in parts."""
-        if self._base is None:
-            raise UsageError("there are no recordings to read, expected at least one")
-        self._intervals.check_all_used(self._names)
-        labelled = {text for s, _ in self._selections.values() for text in s.labels}
-        for text in (text for text in self._recipe.label_columns if text not in labelled):
-            columns = {name for layout in self._selections for name in named_columns(layout)}
-            raise UnknownNameError("column with labels", text, columns)
-        for problem in self._problems:
-            raise TrajectoryError(problem)
-        parts = self._shared_out()
-        for part in (TRAIN, CALIBRATION):
-            if not parts[part]:
-                raise UsageError(
-                    f"there are no {part} episodes, expected at least 1: "
-                    f"{self._nominal_problem(part)}"
-                )
-        kinds = in_order(
-            (part.removeprefix("test/") for part in self._parts if part not in NOMINAL_ROLES),
-            ANOMALIES,
-        )
-        listed = [name for name, table in self._recipe.anomalous.items() if table.files]
-        lacking = [name for name in listed if name not in kinds]
-        if lacking and not kinds:
-            raise UsageError(f"[anomalous.{lacking[0]}] has no episodes, expected at least one")
-        parts |= {f"test/{kind}": self._parts[f"test/{kind}"] for kind in kinds}
-        unused = dict.fromkeys(name for s, _ in self._selections.values() for name in s.unused)
-        source = self._source(parts)
-        source.groups = {kind: self._group(kind) for kind in kinds}
-        source.unused = tuple(unused)
-        _settle_columns(source, self._recipe)
-        source.notes[:0] = self._notes(source)
-        if lacking:
-            source.notes.append(f"no episodes of these anomalies: {', '.join(lacking)}")
-        return source
-
-    def _source(self, parts: dict[str, list[EpisodeFacts]]) -> EpisodeSource:
-        if self._base is None or not parts:
-            raise UsageError("there are no episodes to read, expected at least one")
-        converter = self._base.converter
-        rewards, columns = self._base.selection.reward is not None, tuple(range(converter.width))
-        source = EpisodeSource(
-            converter.sensors,
-            converter.actions,
-            converter.discrete,
-            rewards,
-            self._base.spool,
-            columns,
-        )
-        source.rate, source.parts = self._recipe.rate, parts
-        if source.rate is None and self._steps:
-            source.rate = even_rate(self._steps)
-        return source
-
-    def _group(self, kind: str) -> Group:
-        if kind in ANOMALIES:
-            return ANOMALIES[kind].group
-        return self._recipe.anomalous.get(kind, _NO_FILES).group
-
-    def _nominal_problem(self, part: str) -> str:
-        if count := len(self._parts.get(FILES, ())):
-            return f"the nominal files make {count}; a window cuts long recordings into several"
-        if left_out := [counted(n, what) for what, n in self._left_out.items() if n]:
-            return f"left out are {', '.join(left_out)}"
-        return f"[nominal] names no file with one for {part}"
-
-    def _shared_out(self) -> dict[str, list[EpisodeFacts]]:
-        """Return nominal episodes by part: shares of each task, in the order of the recording."""
-        parts: dict[str, list[EpisodeFacts]] = {p: self._parts.get(p, []) for p in _SHARED}
-        episodes = list(self._parts.get(FILES, []))
-        if self._by_stamps():
-            episodes.sort(key=lambda facts: facts.begin)
-        if self._recipe.order == "shuffled":
-            order = np.random.default_rng(self._recipe.seed).permutation(len(episodes))
-            episodes = [episodes[i] for i in order]
-        tasks = dict.fromkeys(facts.task for facts in episodes)
-        for task in tasks:
-            of_task = [facts for facts in episodes if facts.task == task]
-            shares = np.cumsum(self._recipe.nominal.parts)
-            bounds = [0, *np.rint(shares * len(of_task)).astype(int).tolist(), len(of_task)]
-            for part, start, stop in zip(_SHARED, bounds, bounds[1:], strict=False):
-                parts[part] = parts[part] + of_task[start:stop]
-        return parts
-
-    def _by_stamps(self) -> bool:
-        """Tell whether stamps order the recordings: none begins before another's end."""
-        spans = sorted(self._spans)
-        return len(spans) == self._recordings and all(
-            a[1] < b[0] for a, b in itertools.pairwise(spans)
-        )
-
-    def _lost(self) -> list[str]:
-        """Return a line for each reason for which rows were dropped, held or left out."""
-        return [
-            *self._tally.lines(),
-            *(f"left out: {counted(n, what)}" for what, n in self._left_out.items() if n),
-        ]
-
-    def _notes(self, source: EpisodeSource) -> list[str]:
-        sizes = (
-            f"{counted(len(source.sensors), 'sensor(s)')}, "
-            f"{counted(len(source.actions), 'action(s)')}"
-        )
-        lines = [f"read {counted(self._recordings, 'recording(s)')}: {sizes}"]
-        for part, episodes in source.parts.items():
-            rows = sum(facts.rows for facts in episodes)
-            line = f"{part}: {counted(len(episodes), 'episode(s)')}, {counted(rows, 'row(s)')}"
-            if part not in _SHARED:
-                intervals = [i for facts in episodes for i in facts.intervals]
-                anomalous = sum(stop - max(start, 0) for start, stop in intervals)
-                line += (
-                    f", {counted(len(intervals), 'interval(s)')} with "
-                    f"{counted(anomalous, 'anomalous row(s)')}"
-                    if intervals
-                    else ", known by their outcome alone"
-                )
-            if episodes or part != TWINS:
-                lines.append(line)
-            if part in self._cut_by_outcome:
-                lines.append(
-                    f"warning: {part} was cut by window, and nothing says which rows are "
-                    "anomalous: every window counts as anomalous, also those before the fault. "
-                    "Name the anomalous rows (labels, intervals, or onset, which is 0 where the "
-                    "fault is there from the first row on), or leave out window"
-                )
-        if self._recipe.nominal.files:
-            how = "in the order of their stamps" if self._by_stamps() else "in the order of files"
-            if self._recipe.order == "shuffled":
-                how = f"shuffled (seed {self._recipe.seed})"
-            lines.append(f"nominal episodes were shared out {how}")
-        if self._steps and source.rate is None:
-            shortest = min(steps.shortest for steps in self._steps)
-            longest = max(steps.longest for steps in self._steps)
-            lines.append(
-                f"rows are {shortest:g} to {longest:g} s apart and taken as they are: rate in the "
-                "recipe resamples them"
-            )
-        lines += self._lost()
-        if self._base and (choices := self._base.converter.choices):
-            lines.append(
-                f"actions are whole numbers from 0 to {choices - 1}: if they are choices, "
-                f"discrete = {choices} (--discrete {choices}) makes each a column"
-            )
-        if source.unused:
-            further = len(source.unused) - _LISTED
-            more = f" and {further} more, which data inspect lists" if further > 0 else ""
-            listed = ", ".join(source.unused[:_LISTED])
-            lines.append(f"columns that no line names: {listed}{more}")
-        return lines
-
-
 @dataclass(frozen=True, slots=True, eq=False)
-class _Base:
+class _First:
     """Columns of the first recording, which all others share, and where rows are kept."""
 
     selection: Selection
@@ -782,117 +386,445 @@ class _Base:
     source: str
     choices: str
 
-    @classmethod
-    def of(cls, recording: Recording, selection: Selection, recipe: Recipe) -> "_Base":
-        number = recording.fields.get("discrete", 0)
-        if number and not recipe.discrete:
-            names = tuple(map(str, recording.fields.get("choices", ())))
-            recipe = dataclasses.replace(recipe, discrete=names or int(number))
-        start = int(recording.fields.get("start", 0)) if number else 0
-        converter = Converter(selection, recipe, start)
-        spool = Spool(converter.width)
-        return cls(selection, converter, spool, recording.source, _choices(recording))
 
-    def in_order(self, selection: Selection, recording: Recording) -> Selection:
-        """Return a selection with the columns of the first recording, in their order."""
-        # Globs may match further columns in later files: these are unused.
-        if selection == self.selection:
-            return selection
-        sensors, actions = (
-            self._ordered(kind, getattr(self.selection, kind), getattr(selection, kind), recording)
-            for kind in ("sensors", "actions")
+@dataclass(slots=True, eq=False)
+class _Reading:
+    """State of reading recordings one after another, into parts or all into `EVERY`."""
+
+    recipe: Recipe
+    intervals: IntervalList
+    every: bool = False
+    tally: Tally = field(default_factory=Tally)
+    first: _First | None = None
+    selections: dict[Layout, Selection] = field(default_factory=dict)
+    parts: dict[str, list[EpisodeFacts]] = field(default_factory=dict)
+    spans: list[tuple[float, float]] = field(default_factory=list)  # first and last stamps
+    steps: list[Steps] = field(default_factory=list)
+    recordings: int = 0
+    names: set[str] = field(default_factory=set)
+    problems: list[str] = field(default_factory=list)
+    cut_by_outcome: set[str] = field(default_factory=set)  # parts with windows without a label
+
+    @property
+    def shortest(self) -> int:
+        """Rows of the shortest episode."""
+        return max(2, self.recipe.baseline + 1)
+
+    @property
+    def by_stamps(self) -> bool:
+        """Whether stamps order the recordings: none begins before another's end."""
+        pairs = itertools.pairwise(sorted(self.spans))
+        return len(self.spans) == self.recordings and all(a[1] < b[0] for a, b in pairs)
+
+
+def _add(reading: _Reading, recorded: Recorded) -> None:
+    """Read one recording and keep its episodes."""
+    recipe = reading.recipe
+    recorded = recorded.meeting(recipe)
+    recording = recorded.recording
+    if not recorded.roles:
+        reading.tally.leave_out("recording(s) that meet no condition (where)")
+        return
+    selection, first = _selected(reading, recording)
+    reading.recordings += 1
+    reading.names |= {recorded.relative, recording.name}
+    outcome, kind, task = _said_of(recorded, recipe, lenient=reading.every)
+    stamped = StampedRows(recorded, selection, recipe, reading.tally)
+    marks = stamped.marks(reading.intervals, is_anomalous=bool(kind or recorded.kinds))
+    stretches, times = stamped.stretches()
+    if times:
+        reading.spans.append((min(t[0] for t in times), max(t[-1] for t in times)))
+        reading.steps += [steps for t in times if (steps := Steps.of(t)).usual]
+    numbers = itertools.count()
+    for stretch in stretches:
+        above = first.spool.rows
+        spool_stretch(first.spool, stretch, stamped.topics, first.converter, recording.source)
+        rows = rows_of(marks, stretch.positions, stretch.tolerance)
+        is_cut = len(stretches) > 1
+        for part, start, stop, intervals, is_piece in _cut(
+            reading, recorded, kind, stretch.rows, rows, is_cut=is_cut
+        ):
+            number = next(numbers)
+            facts = EpisodeFacts(
+                part,
+                f"{recording.name}#{number}" if is_piece else recording.name,
+                recording.source,
+                above + start,
+                stop - start,
+                () if part in NOMINAL_ROLES else merged(intervals),
+                outcome,
+                task,
+                *stretch.begin_and_step(start, stop),
+                recording.fields,
+            )
+            _keep(reading, facts)
+
+
+def _selected(reading: _Reading, recording: Recording) -> tuple[Selection, _First]:
+    """Return the columns of a recording, and those of the first, in whose order they are."""
+    layout, recipe, source = layout_of(recording), reading.recipe, recording.source
+    discrete, start = (recording.fields.get(name, 0) for name in ("discrete", "start"))
+    is_discrete = str(discrete) != "0"
+    choices = f"{discrete!s:.40} choices from {start!s:.40} on" if is_discrete else "numbers"
+    if layout not in reading.selections:
+        try:
+            selection = select_columns(layout, recipe, source)
+        except UnknownNameError as error:
+            if reading.first is None:
+                raise
+            raise TrajectoryError(f"{error}; {reading.first.source} has it") from None
+        if reading.first is None:
+            if discrete and not recipe.discrete:
+                names = tuple(map(str, recording.fields.get("choices", ())))
+                recipe = dataclasses.replace(recipe, discrete=names or int(discrete))
+            converter = Converter(selection, recipe, int(start) if discrete else 0)
+            spool = Spool(converter.width)
+            reading.first = _First(selection, converter, spool, source, choices)
+        reading.selections[layout] = _in_order(selection, reading.first, source)
+    first = cast("_First", reading.first)
+    if choices != first.choices:
+        raise TrajectoryError(
+            f"{source}: its actions are {choices}, expected {first.choices} as in {first.source}"
         )
-        if (selection.reward is None) != (self.selection.reward is None):
-            raise TrajectoryError(f"{recording.source}: only some of the files have rewards")
-        chosen = {*sensors, *actions}
-        further = (c for c in (*selection.sensors, *selection.actions) if c not in chosen)
-        unused = (*selection.unused, *(column.quantity.name for column in further))
-        return dataclasses.replace(selection, sensors=sensors, actions=actions, unused=unused)
+    return reading.selections[layout], first
 
-    def _ordered(
-        self,
-        kind: str,
-        expected: Sequence[ChosenColumn],
-        actual: Sequence[ChosenColumn],
-        recording: Recording,
-    ) -> tuple[ChosenColumn, ...]:
-        by_name = {column.quantity: column for column in actual}
-        quantities = [column.quantity for column in expected]
-        if lacking := [q for q in quantities if q not in by_name]:
+
+def _in_order(selection: Selection, first: _First, source: str) -> Selection:
+    """Return a selection with the columns of the first recording, in their order."""
+    # Globs may match further columns in later files: these are unused.
+    if selection == first.selection:
+        return selection
+    ordered: dict[str, tuple[ChosenColumn, ...]] = {}
+    for kind in ("sensors", "actions"):
+        expected = [column.quantity for column in getattr(first.selection, kind)]
+        by_name = {column.quantity: column for column in getattr(selection, kind)}
+        if lacking := [q for q in expected if q not in by_name]:
             names = ", ".join(f"{q.name}[{q.unit}]" for q in lacking[:6])
             raise TrajectoryError(
-                f"{recording.source} has {len(actual)} {kind}, {self.source} {len(expected)}: it "
-                f"lacks {names}; expected the same in all files, by name and unit"
+                f"{source} has {len(getattr(selection, kind))} {kind}, {first.source} "
+                f"{len(expected)}: it lacks {names}; expected the same in all files, by name and "
+                "unit"
             )
-        return tuple(by_name[quantity] for quantity in quantities)
+        ordered[kind] = tuple(by_name[quantity] for quantity in expected)
+    if (selection.reward is None) != (first.selection.reward is None):
+        raise TrajectoryError(f"{source}: only some of the files have rewards")
+    shared = {*ordered["sensors"], *ordered["actions"]}
+    further = (c for c in (*selection.sensors, *selection.actions) if c not in shared)
+    unused = (*selection.unused, *(column.quantity.name for column in further))
+    return dataclasses.replace(
+        selection, sensors=ordered["sensors"], actions=ordered["actions"], unused=unused
+    )
 
 
-def _times(stretch: Stretch, start: int, stop: int) -> tuple[float, float]:
-    """Return time of the first row and seconds between rows, NaN without stamps."""
-    if stretch.positions.dtype.kind != "f":
-        return float("nan"), float("nan")
-    times = stretch.positions[start:stop]
-    return float(times[0]), float((times[-1] - times[0]) / max(1, len(times) - 1))
+def _said_of(recorded: Recorded, recipe: Recipe, *, lenient: bool) -> tuple[bool | None, str, str]:
+    """Return outcome, anomaly and task of a recording by its fields, None or empty without."""
 
-
-class _EveryMaker(_Maker):
-    """Makes episodes of all rows, of which labels only tell the names of anomalies."""
-
-    def _windows(self, recorded: Recorded) -> dict[int, set[str]]:
-        window = self._recipe.nominal.window
-        return {self._recipe.window if window is None else window: {*recorded.roles}}
-
-    def _targets(
-        self,
-        recorded: Recorded,
-        roles: set[str],
-        kind: str,
-        inside: Sequence[AnomalousRows],
-        *,
-        is_piece: bool,
-    ) -> list[str]:
-        del recorded, is_piece
-        by_files = sorted(role for role in roles - NOMINAL_ROLES)
-        names = [f"test/{name}" for *_, name in inside if name]
-        if kind:
-            return [f"test/{kind}"]
-        if inside:
-            return (names or by_files or [f"test/{_ANOMALOUS}"])[:1]
-        labelled = any(self._says_rows(role.removeprefix("test/")) for role in by_files)
-        return by_files[:1] if by_files and not labelled else [EVERY]
-
-    def _takes_whole_windows(self, parts: Sequence[str], inside: Sequence[AnomalousRows]) -> bool:
-        del parts, inside
-        return False
-
-    def _value(self, recorded: Recorded, name: str, *, last: bool = False) -> str | None:
+    def value(name: str, *, last: bool = False) -> str | None:
         try:
-            return super()._value(recorded, name, last=last)
+            return recorded.text(name, last=last) if name else None
         except UnknownNameError:
-            return None
+            if lenient:
+                return None
+            raise
 
-    def _refuse_short(self, recording: Recording, rows: int, *, is_piece: bool) -> None:
-        del is_piece
-        super()._refuse_short(recording, rows, is_piece=True)
+    text = value(recipe.outcome, last=True)
+    outcome = None if text is None else text.lower() in _TRUE
+    if text is not None and text.lower() not in _TRUE | _FALSE:
+        raise TrajectoryError(
+            f"{recorded.source}: {recipe.outcome} is {text.lower()!r}, expected true or false"
+        )
+    kind = ""
+    if (text := value(recipe.kinds)) is not None:
+        nominal = map(text_of, recipe.nominal.where.get(recipe.kinds, ()))
+        kind = "" if text in nominal else anomaly_name(text)
+    elif outcome is False:
+        fallback = [name for name, table in recipe.anomalous.items() if not table.files]
+        kind = next(iter([*recorded.kinds, *fallback]), FAILURE)
+    return outcome, kind, value(recipe.task) or ""
 
-    def _keep(self, facts: EpisodeFacts) -> None:
-        self._parts.setdefault(EVERY, []).append(facts)
 
-    def finish(self) -> EpisodeSource:
-        source = self._source(self._parts)
-        if self._by_stamps():
-            self._parts[EVERY].sort(key=lambda facts: facts.begin)
-        source.notes += self._lost()
-        return source
+def _cut(
+    reading: _Reading,
+    recorded: Recorded,
+    kind: str,
+    total: int,
+    rows: Sequence[AnomalousRows],
+    *,
+    is_cut: bool,
+) -> Iterator[tuple[str, int, int, Sequence[AnomalousRows], bool]]:
+    """Yield part, rows and anomalous rows of the episodes of a stretch, and if it was cut."""
+    for window, roles in _windows(reading, recorded).items():
+        has_windows = 0 < window < total
+        is_piece = has_windows or is_cut
+        length = window if has_windows else total
+        for start in range(0, total, length):
+            stop = min(start + length, total)
+            inside = [
+                (a - start if a > start else 0 if a >= 0 or start else -1, min(b, stop) - start, n)
+                for a, b, n in rows
+                if b > start and a < stop
+            ]
+            parts = _parts_of(reading, recorded, roles, kind, inside, is_piece=is_piece)
+            # A short last window is kept where it is labelled, and where all are to be judged.
+            takes_short = reading.every or not (NOMINAL_ROLES & {*parts} or (parts and not inside))
+            if stop - start < length and not takes_short:
+                reading.tally.leave_out(
+                    "row(s) at ends of recordings, less than a window", stop - start
+                )
+            elif stop - start < reading.shortest:
+                if not (is_piece or reading.every):
+                    raise _too_short(reading, recorded.recording, stop - start)
+                reading.tally.leave_out(f"piece(s) shorter than {reading.shortest} rows")
+            else:
+                if has_windows and not inside:
+                    reading.cut_by_outcome |= {*parts} - NOMINAL_ROLES
+                yield from ((part, start, stop, inside, is_piece) for part in parts)
 
 
-def _clipped(rows: Sequence[AnomalousRows], start: int, stop: int) -> list[AnomalousRows]:
-    """Return the anomalous rows within a window, counted from its start."""
-    return [
-        (a - start if a > start else 0 if a >= 0 or start else -1, min(b, stop) - start, kind)
-        for a, b, kind in rows
-        if b > start and a < stop
-    ]
+def _windows(reading: _Reading, recorded: Recorded) -> dict[int, set[str]]:
+    """Return the roles of a recording by the length of their windows."""
+    windows: dict[int, set[str]] = {}
+    recipe = reading.recipe
+    for role in sorted(recorded.roles):
+        is_nominal = reading.every or role in NOMINAL_ROLES
+        table = recipe.nominal if is_nominal else recipe.anomalous[role.removeprefix("test/")]
+        length = recipe.window if table.window is None else table.window
+        windows.setdefault(length, set()).add(role)
+    return windows
+
+
+def _parts_of(
+    reading: _Reading,
+    recorded: Recorded,
+    roles: set[str],
+    kind: str,
+    inside: Sequence[AnomalousRows],
+    *,
+    is_piece: bool,
+) -> list[str]:
+    """Return the parts that an episode of a recording belongs to."""
+    source, recipe, tally = recorded.source, reading.recipe, reading.tally
+    nominal = sorted(roles & NOMINAL_ROLES)
+    kinds = {role.removeprefix("test/") for role in roles - NOMINAL_ROLES}
+    labelled = {name for *_, name in inside}
+    if kind:
+        return [f"test/{kind}"]
+    if reading.every:
+        if inside:
+            named = [name for *_, name in inside if name]
+            return [f"test/{(named or sorted(kinds) or [_ANOMALOUS])[0]}"]
+        is_said = any(_says_rows(reading, name) for name in kinds)
+        return [f"test/{name}" for name in sorted(kinds) if not is_said][:1] or [EVERY]
+    if recipe.kinds or recipe.outcome:
+        tally.leave_out("nominal recording(s) in files of an anomaly alone", not nominal)
+        return nominal
+    # Intervals may name an anomaly that has no files of its own.
+    kinds |= {n for n in labelled if n and not recipe.anomalous.get(n, _NO_FILES).files}
+    if not inside:
+        if nominal:
+            return nominal
+        if recipe.paired or not any(_says_rows(reading, name) for name in kinds):
+            return [f"test/{name}" for name in sorted(kinds)]
+        if is_piece:
+            tally.leave_out("window(s) of anomalous recordings without an anomalous row")
+            return []
+        # Raised at the end, as the names in a list of intervals may be wrong.
+        reading.problems.append(
+            f"{source} has no anomalous row by its labels, expected some as it is listed under "
+            f"{', '.join(sorted(kinds))}: leave it out, or list it under [nominal]"
+        )
+        return []
+    matching = [f"test/{name}" for name in sorted(kinds) if labelled & {"", name}]
+    if not matching and nominal and not is_piece:
+        start, stop, _ = inside[0]
+        raise TrajectoryError(
+            f"{source} is listed as nominal, but is anomalous in rows {max(start, 0)} to "
+            f"{stop - 1}: list it under [anomalous.NAME], or cut it with window, so that the "
+            "windows without anomalous rows are nominal; labels of nominal rows other than 0, "
+            "false, H or nothing are named by nominal_label"
+        )
+    tally.leave_out("window(s) with anomalous rows, of nominal files", not matching)
+    return matching
+
+
+def _says_rows(reading: _Reading, kind: str) -> bool:
+    """Tell whether the recipe says which rows of an anomaly are anomalous."""
+    recipe, table = reading.recipe, reading.recipe.anomalous.get(kind, _NO_FILES)
+    onset = recipe.onset if table.onset is None else table.onset
+    return bool(recipe.labels or table.labels or reading.intervals or onset is not None)
+
+
+def _too_short(reading: _Reading, recording: Recording, rows: int) -> TrajectoryError:
+    least, rate = reading.shortest, reading.recipe.rate
+    why = ", more than the baseline" if least > 2 else ""
+    logged = max(topic.rows for topic in recording.topics.values())
+    if rate and logged >= least:
+        why += (
+            f"; {logged} rows were logged: are rate = {rate:g} and the unit of the stamps right, "
+            "as in time = 'NAME[ms]'?"
+        )
+    return TrajectoryError(
+        f"{recording.source} has {counted(rows, 'observation(s)')}, expected at least {least}{why}"
+    )
+
+
+def _keep(reading: _Reading, facts: EpisodeFacts) -> None:
+    baseline = 0 if reading.every else reading.recipe.baseline
+    if early := [start for start, _ in facts.intervals if 0 <= start < baseline]:
+        if "#" not in facts.name:
+            raise TrajectoryError(
+                f"{facts.source} is anomalous from row {early[0]} on, expected its first "
+                f"{baseline} rows (baseline) to be nominal"
+            )
+        reading.tally.leave_out("window(s) that are anomalous within their baseline")
+        return
+    episodes = reading.parts.setdefault(EVERY if reading.every else facts.part, [])
+    if len(episodes) == EPISODES and not reading.every:
+        raise UsageError(f"{facts.part} has more than {EPISODES} episodes, the most there are")
+    episodes.append(facts)
+
+
+def _every_episode(reading: _Reading) -> EpisodeSource:
+    """Return all episodes as one part, in the order of stamps if these tell it."""
+    source = _source(reading, reading.parts)
+    if reading.by_stamps:
+        reading.parts[EVERY].sort(key=lambda facts: facts.begin)
+    source.notes += reading.tally.lines()
+    return source
+
+
+def _in_parts(reading: _Reading) -> EpisodeSource:
+    """Return all episodes, in parts."""
+    recipe, selections = reading.recipe, reading.selections
+    if reading.first is None:
+        raise UsageError("there are no recordings to read, expected at least one")
+    reading.intervals.check_all_used(reading.names)
+    labelled = {text for selection in selections.values() for text in selection.labels}
+    for text in (text for text in recipe.label_columns if text not in labelled):
+        columns = {name for layout in selections for name in named_columns(layout)}
+        raise UnknownNameError("column with labels", text, columns)
+    for problem in reading.problems:
+        raise TrajectoryError(problem)
+    parts = _shared_out(reading)
+    for part in (TRAIN, CALIBRATION):
+        if not parts[part]:
+            raise UsageError(
+                f"there are no {part} episodes, expected at least 1: "
+                f"{_nominal_problem(reading, part)}"
+            )
+    kinds = in_order(
+        (part.removeprefix("test/") for part in reading.parts if part not in NOMINAL_ROLES),
+        ANOMALIES,
+    )
+    listed = [name for name, table in recipe.anomalous.items() if table.files]
+    lacking = [name for name in listed if name not in kinds]
+    if lacking and not kinds:
+        raise UsageError(f"[anomalous.{lacking[0]}] has no episodes, expected at least one")
+    parts |= {f"test/{kind}": reading.parts[f"test/{kind}"] for kind in kinds}
+    source = _source(reading, parts)
+    groups = {kind: recipe.anomalous.get(kind, _NO_FILES).group for kind in kinds}
+    source.groups = groups | {kind: ANOMALIES[kind].group for kind in kinds if kind in ANOMALIES}
+    source.unused = tuple(dict.fromkeys(name for s in selections.values() for name in s.unused))
+    _settle_columns(source, recipe)
+    source.notes[:0] = _notes(reading, source)
+    if lacking:
+        source.notes.append(f"no episodes of these anomalies: {', '.join(lacking)}")
+    return source
+
+
+def _source(reading: _Reading, parts: dict[str, list[EpisodeFacts]]) -> EpisodeSource:
+    if reading.first is None or not parts:
+        raise UsageError("there are no episodes to read, expected at least one")
+    converter, rate = reading.first.converter, reading.recipe.rate
+    if rate is None and reading.steps:
+        rate = even_rate(reading.steps)
+    return EpisodeSource(
+        converter.sensors,
+        converter.actions,
+        converter.discrete,
+        reading.first.selection.reward is not None,
+        reading.first.spool,
+        tuple(range(converter.width)),
+        rate,
+        parts,
+    )
+
+
+def _nominal_problem(reading: _Reading, part: str) -> str:
+    if count := len(reading.parts.get(FILES, ())):
+        return f"the nominal files make {count}; a window cuts long recordings into several"
+    if left_out := [counted(n, what) for what, n in reading.tally.left_out.items() if n]:
+        return f"left out are {', '.join(left_out)}"
+    return f"[nominal] names no file with one for {part}"
+
+
+def _shared_out(reading: _Reading) -> dict[str, list[EpisodeFacts]]:
+    """Return nominal episodes by part: shares of each task, in the order of the recording."""
+    recipe = reading.recipe
+    parts: dict[str, list[EpisodeFacts]] = {p: reading.parts.get(p, []) for p in _SHARED}
+    episodes = list(reading.parts.get(FILES, []))
+    if reading.by_stamps:
+        episodes.sort(key=lambda facts: facts.begin)
+    if recipe.order == "shuffled":
+        order = np.random.default_rng(recipe.seed).permutation(len(episodes))
+        episodes = [episodes[i] for i in order]
+    for task in dict.fromkeys(facts.task for facts in episodes):
+        of_task = [facts for facts in episodes if facts.task == task]
+        shares = np.cumsum(recipe.nominal.parts)
+        bounds = [0, *np.rint(shares * len(of_task)).astype(int).tolist(), len(of_task)]
+        for part, start, stop in zip(_SHARED, bounds, bounds[1:], strict=False):
+            parts[part] = parts[part] + of_task[start:stop]
+    return parts
+
+
+def _notes(reading: _Reading, source: EpisodeSource) -> list[str]:
+    recipe = reading.recipe
+    sensors = counted(len(source.sensors), "sensor(s)")
+    actions = counted(len(source.actions), "action(s)")
+    lines = [f"read {counted(reading.recordings, 'recording(s)')}: {sensors}, {actions}"]
+    for part, episodes in source.parts.items():
+        rows = sum(facts.rows for facts in episodes)
+        line = f"{part}: {counted(len(episodes), 'episode(s)')}, {counted(rows, 'row(s)')}"
+        intervals = [interval for facts in episodes for interval in facts.intervals]
+        if part not in _SHARED and intervals:
+            anomalous = sum(stop - max(start, 0) for start, stop in intervals)
+            line += f", {counted(len(intervals), 'interval(s)')} with "
+            line += counted(anomalous, "anomalous row(s)")
+        elif part not in _SHARED:
+            line += ", known by their outcome alone"
+        if episodes or part != TWINS:
+            lines.append(line)
+        if part in reading.cut_by_outcome:
+            lines.append(
+                f"warning: {part} was cut by window, and nothing says which rows are "
+                "anomalous: every window counts as anomalous, also those before the fault. "
+                "Name the anomalous rows (labels, intervals, or onset, which is 0 where the "
+                "fault is there from the first row on), or leave out window"
+            )
+    if recipe.nominal.files:
+        how = "in the order of their stamps" if reading.by_stamps else "in the order of files"
+        if recipe.order == "shuffled":
+            how = f"shuffled (seed {recipe.seed})"
+        lines.append(f"nominal episodes were shared out {how}")
+    if reading.steps and source.rate is None:
+        shortest = min(steps.shortest for steps in reading.steps)
+        longest = max(steps.longest for steps in reading.steps)
+        lines.append(
+            f"rows are {shortest:g} to {longest:g} s apart and taken as they are: rate in the "
+            "recipe resamples them"
+        )
+    lines += reading.tally.lines()
+    if reading.first and (choices := reading.first.converter.choices):
+        lines.append(
+            f"actions are whole numbers from 0 to {choices - 1}: if they are choices, "
+            f"discrete = {choices} (--discrete {choices}) makes each a column"
+        )
+    if source.unused:
+        further = len(source.unused) - _LISTED
+        more = f" and {further} more, which data inspect lists" if further > 0 else ""
+        names = ", ".join(source.unused[:_LISTED])
+        lines.append(f"columns that no line names: {names}{more}")
+    return lines
 
 
 def _settle_columns(source: EpisodeSource, recipe: Recipe) -> None:
@@ -936,8 +868,3 @@ def _moments(source: EpisodeSource, episodes: Iterable[EpisodeFacts]) -> Running
         for rows in source.blocks(facts):
             moments.add(rows[:, : len(source.sensors)])
     return moments
-
-
-def _choices(recording: Recording) -> str:
-    number, start = (str(recording.fields.get(name, 0)) for name in ("discrete", "start"))
-    return f"{number:.40} choices from {start:.40} on" if number != "0" else "numbers"

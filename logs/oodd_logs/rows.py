@@ -33,9 +33,10 @@ Matrix = NDArray[np.float64]
 
 @dataclass(slots=True)
 class Tally:
-    """Counts of rows dropped and held while rows were read, for the message at the end."""
+    """Counts of rows dropped and held, and of what was left out, for the message at the end."""
 
     rows: Counter[str] = field(default_factory=Counter)
+    left_out: Counter[str] = field(default_factory=Counter)
     files: dict[str, set[str]] = field(default_factory=dict)
 
     def add(self, what: str, rows: int, source: str) -> None:
@@ -44,11 +45,18 @@ class Tally:
             self.rows[what] += rows
             self.files.setdefault(what, set()).add(source)
 
+    def leave_out(self, what: str, number: int = 1) -> None:
+        """Count what was left out."""
+        self.left_out[what] += number
+
     def lines(self) -> list[str]:
         """Return a line for each thing that was counted."""
         return [
-            f"{what}: {n} in {counted(len(self.files[what]), 'recording(s)')}"
-            for what, n in self.rows.items()
+            *(
+                f"{what}: {n} in {counted(len(self.files[what]), 'recording(s)')}"
+                for what, n in self.rows.items()
+            ),
+            *(f"left out: {counted(n, what)}" for what, n in self.left_out.items() if n),
         ]
 
 

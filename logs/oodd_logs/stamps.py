@@ -41,6 +41,13 @@ class Stretch:
     positions: NDArray[Any]
     tolerance: float = 0.0
 
+    def begin_and_step(self, start: int, stop: int) -> tuple[float, float]:
+        """Return time of the first row and seconds between rows, NaN without stamps."""
+        if self.positions.dtype.kind != "f":
+            return float("nan"), float("nan")
+        times = self.positions[start:stop]
+        return float(times[0]), float((times[-1] - times[0]) / max(1, len(times) - 1))
+
 
 def unit_of(unit: str) -> str:
     """Return the name of a unit of time; stamps without a unit are seconds."""
