@@ -6,9 +6,9 @@ A recipe names files, columns and labels, and says how rows become episodes. Not
 import datetime as dt
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, get_origin, get_type_hints
 
 from oodd_eval.data.bounded import read_toml
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, NAME_PATTERN, SPLITS, Group, Order
@@ -29,285 +29,6 @@ Missing = Literal["refuse", "hold", "drop", "keep"]
 """Treatments of missing values; they are kept, as NaN, for scans alone."""
 Interval = tuple[str, int | float | str | None, int | float | str | None, str]
 """File, start, stop and kind; a start or stop is a row, a time, or None where it is not known."""
-
-
-@dataclass(frozen=True, slots=True)
-class NominalFiles:
-    """Files of nominal episodes: the table ``[nominal]`` of a recipe.
-
-    Parameters
-    ----------
-    files
-        Globs of files whose episodes are shared out by `parts`.
-    parts
-        Shares of training, calibration and test among the episodes of `files`.
-    train, calibration, test
-        Globs of files with episodes of that part.
-    twins
-        Globs of files with the nominal twins of a paired recipe.
-    where
-        Values of a field, or of a column, that nominal episodes have; empty for no condition.
-    window
-        In place of the recipe's.
-    """
-
-    files: tuple[str, ...] = ()
-    parts: tuple[float, ...] = SHARES
-    train: tuple[str, ...] = ()
-    calibration: tuple[str, ...] = ()
-    test: tuple[str, ...] = ()
-    twins: tuple[str, ...] = ()
-    where: Mapping[str, tuple[Any, ...]] = field(default_factory=dict)
-    window: int | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class AnomalousFiles:
-    """Files of episodes with one anomaly: a table ``[anomalous.NAME]`` of a recipe.
-
-    Parameters
-    ----------
-    files
-        Globs of files; empty where `Recipe.kinds` or `Recipe.outcome` tells the episodes apart.
-    group
-        Group of the anomaly.
-    where
-        Values of a field, or of a column, that these episodes have; empty for no condition.
-    labels
-        In place of the recipe's.
-    onset, stop
-        First anomalous row of each file, and the row after the last; None where not the same.
-    window
-        In place of the recipe's.
-    """
-
-    files: tuple[str, ...] = ()
-    group: Group = "dynamics"
-    where: Mapping[str, tuple[Any, ...]] = field(default_factory=dict)
-    labels: tuple[str, ...] = ()
-    onset: int | None = None
-    stop: int | None = None
-    window: int | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Recipe:
-    """A recipe that makes one environment of a split from logs.
-
-    Parameters
-    ----------
-    split, environment
-        Names of both.
-    source, licence, citation
-        Where the logs are from.
-    time
-        Column with time stamps, ``NAME[s]``, ``[ms]``, ``[us]`` or ``[ns]``, or ISO 8601; empty for
-        the format's own, or none.
-    rate
-        Rows in a second of the result, to which rows are resampled, the last value held; None for
-        rows as they are.
-    gap
-        Seconds without a row beyond which a recording is cut; None refuses long gaps, and 0, for
-        scans, cuts there.
-    sensors, actions
-        Globs over columns or ``topic.field``, in order; ``"new = old"`` renames, ``NAME[UNIT]``
-        names the unit. Without sensors, the columns ``obs:NAME[UNIT]`` and ``action:NAME[UNIT]``.
-    reward
-        Column with rewards.
-    discrete
-        Number of actions, or their names, where each action is a whole number from 0 on.
-    angles
-        Globs of sensors that are replaced by their sine and cosine.
-    constant
-        What becomes of sensors that are constant in the training part: ``"keep"`` or ``"drop"``.
-    missing
-        What missing values do: ``"refuse"``, ``"hold"`` the last value, or ``"drop"`` the row.
-    missing_rows
-        Most rows in a run that are held or dropped.
-    labels
-        Columns that are nominal where they are 0, empty, false, ``"H"`` or `nominal_label`.
-    nominal_label
-        Values of the labels of nominal rows, in place of these.
-    intervals
-        Anomalous rows, or times, of files.
-    onset, stop
-        First anomalous row of each anomalous file, and the row after the last, if always the same.
-    outcome
-        Field, or column, that is true of episodes that succeeded: others are anomalous.
-    kinds
-        Field, or column, whose value names the anomaly of each episode.
-    task
-        Field, or column, with the task or set point of each episode.
-    baseline
-        Number of rows at the start of every episode that are nominal and not judged; 0 for none.
-    window
-        Rows to which longer recordings are cut; 0 for whole recordings.
-    clock
-        Whether row t of one episode may be compared with row t of another.
-    order
-        Whether parts follow one another as recorded, or episodes are shuffled before.
-    seed
-        Of the shuffling.
-    paired
-        Whether each anomalous episode has a nominal twin in a file of the same name.
-    format
-        Format of the files; empty to tell by their endings.
-    options
-        Of the format's reader.
-    nominal
-        Where nominal episodes are.
-    anomalous
-        Where anomalous episodes are, by the name of the anomaly.
-    """
-
-    split: str
-    environment: str
-    source: str = ""
-    licence: str = ""
-    citation: str = ""
-    time: str = ""
-    rate: float | None = None
-    gap: float | None = None
-    sensors: tuple[str, ...] = ()
-    actions: tuple[str, ...] = ()
-    reward: str = ""
-    discrete: int | tuple[str, ...] = 0
-    angles: tuple[str, ...] = ()
-    constant: Literal["keep", "drop"] = "keep"
-    missing: Missing = "refuse"
-    missing_rows: int = MISSING_ROWS
-    labels: tuple[str, ...] = ()
-    nominal_label: tuple[Any, ...] = ()
-    intervals: str | tuple[Interval, ...] = ()
-    onset: int | None = None
-    stop: int | None = None
-    outcome: str = ""
-    kinds: str = ""
-    task: str = ""
-    baseline: int = 0
-    window: int = 0
-    clock: bool = True
-    order: Order = "recorded"
-    seed: int = 0
-    paired: bool = False
-    format: str = ""
-    options: Mapping[str, Any] = field(default_factory=dict)
-    nominal: NominalFiles = field(default_factory=NominalFiles)
-    anomalous: Mapping[str, AnomalousFiles] = field(default_factory=dict)
-
-    @property
-    def label_columns(self) -> tuple[str, ...]:
-        """Columns with labels, of all anomalies."""
-        further = (column for table in self.anomalous.values() for column in table.labels)
-        return tuple(dict.fromkeys([*self.labels, *further]))
-
-    @classmethod
-    def load(cls, path: Path) -> "Recipe":
-        """Read a recipe.
-
-        Parameters
-        ----------
-        path
-            A TOML file.
-
-        Returns
-        -------
-        Recipe
-
-        Raises
-        ------
-        UsageError
-            When the file cannot be read or is no recipe; the message names the key.
-        """
-        return cls.parse(read_toml(path, UsageError), str(path))
-
-    @classmethod
-    def parse(cls, content: Mapping[str, Any], source: str = "the recipe") -> "Recipe":
-        """Check the content of a recipe.
-
-        Parameters
-        ----------
-        content
-            Keys and tables as in TOML.
-        source
-            What messages call it.
-
-        Returns
-        -------
-        Recipe
-
-        Raises
-        ------
-        UsageError
-            For an unknown or wrong key, with the nearest one, or keys that contradict each other.
-        """
-        values = _checked(source, content, _READERS)
-        if "split" not in values:
-            raise UsageError(f"{source} lacks the key 'split', the name of the split to make")
-        options = dict(values.pop("read", {}))
-        files = {"format": _text("[read]: format", options.pop("format", "")), "options": options}
-        recipe = cls(**{"environment": values["split"]} | values | files)
-        recipe.check(source)
-        return recipe
-
-    def check(self, source: str = "the recipe") -> None:
-        """Raise `UsageError` when names are taken or wrong, or keys contradict each other.
-
-        Parameters
-        ----------
-        source
-            What messages call the recipe.
-
-        Raises
-        ------
-        UsageError
-            With the key and what to do.
-        """
-        for kind, reserved, name in (
-            ("split", SPLITS, self.split),
-            ("environment", ENVIRONMENTS, self.environment),
-        ):
-            if name in reserved:
-                raise UsageError(f"{name!r} is the benchmark's {kind}: choose a name of your own")
-            check_name(kind, name)
-        for name, table in self.anomalous.items():
-            check_name("anomaly", name)
-            if name == "nominal":
-                raise UsageError(f"{source}: 'nominal' cannot be the name of an anomaly")
-            check_known("group", GROUPS, table.group)
-            if name in ANOMALIES and ANOMALIES[name].group != table.group:
-                shipped = ANOMALIES[name].group
-                raise UsageError(f"{name!r} is a {shipped} anomaly of the benchmark: rename it")
-        nominal = self.nominal
-        if not (nominal.files or nominal.train):
-            raise UsageError(f"{source}: [nominal] names neither files nor train, expected one")
-        if nominal.files and (nominal.train or nominal.calibration):
-            raise UsageError(
-                f"{source}: [nominal] has both files and parts of its own: name either files with "
-                "their shares, or train, calibration and test"
-            )
-        if nominal.train and not nominal.calibration:
-            raise UsageError(
-                f"{source}: [nominal] names train, but no calibration, which thresholds need"
-            )
-        if self.paired:
-            self._check_paired(source)
-        elif nominal.twins:
-            raise UsageError(f"{source}: [nominal] names twins, expected paired = true with them")
-        if self.gap is not None and not self.time and self.rate is None:
-            raise UsageError(f"{source}: gap needs stamps: name their column with time")
-        if self.stop is not None and self.onset is None:
-            raise UsageError(f"{source}: stop is the end of what onset begins: name onset, too")
-
-    def _check_paired(self, source: str) -> None:
-        if self.anomalous and not self.nominal.twins:
-            raise UsageError(
-                f"{source}: paired = true needs [nominal] twins: nominal episodes, each of which "
-                "has the file name of the anomalous one that it is compared with"
-            )
-        for key in ("window", "baseline", "outcome", "kinds", "task"):
-            if getattr(self, key):
-                raise UsageError(f"{source}: paired = true and {key} exclude each other")
 
 
 def check_name(kind: str, name: str) -> None:
@@ -451,68 +172,329 @@ def _moment(key: str, value: Any) -> int | float | str | None:
     return value
 
 
+Text = Annotated[str, _text]
+Texts = Annotated[tuple[str, ...], _texts]
+Globs = Annotated[tuple[str, ...], _globs]
+Conditions = Annotated[Mapping[str, tuple[Any, ...]], _conditions]
+Flag = Annotated[bool, _flag]
+Number = Annotated[float | None, _number]
+Row = Annotated[int | None, _whole(0)]
+Stop = Annotated[int | None, _whole(1)]
+Length = Annotated[int, _whole(2, also=0)]
+Whole = Annotated[int, _whole(0)]
+
+
+@dataclass(frozen=True, slots=True)
+class NominalFiles:
+    """Files of nominal episodes: the table ``[nominal]`` of a recipe.
+
+    Parameters
+    ----------
+    files
+        Globs of files whose episodes are shared out by `parts`.
+    parts
+        Shares of training, calibration and test among the episodes of `files`.
+    train, calibration, test
+        Globs of files with episodes of that part.
+    twins
+        Globs of files with the nominal twins of a paired recipe.
+    where
+        Values of a field, or of a column, that nominal episodes have; empty for no condition.
+    window
+        In place of the recipe's.
+    """
+
+    files: Globs = ()
+    parts: Annotated[tuple[float, ...], _shares] = SHARES
+    train: Globs = ()
+    calibration: Globs = ()
+    test: Globs = ()
+    twins: Globs = ()
+    where: Conditions = field(default_factory=dict)
+    window: Annotated[int | None, _whole(2, also=0)] = None
+
+
+@dataclass(frozen=True, slots=True)
+class AnomalousFiles:
+    """Files of episodes with one anomaly: a table ``[anomalous.NAME]`` of a recipe.
+
+    Parameters
+    ----------
+    files
+        Globs of files; empty where `Recipe.kinds` or `Recipe.outcome` tells the episodes apart.
+    group
+        Group of the anomaly.
+    where
+        Values of a field, or of a column, that these episodes have; empty for no condition.
+    labels
+        In place of the recipe's.
+    onset, stop
+        First anomalous row of each file, and the row after the last; None where not the same.
+    window
+        In place of the recipe's.
+    """
+
+    files: Globs = ()
+    group: Annotated[Group, _choice(*GROUPS)] = "dynamics"
+    where: Conditions = field(default_factory=dict)
+    labels: Texts = ()
+    onset: Row = None
+    stop: Stop = None
+    window: Annotated[int | None, _whole(2, also=0)] = None
+
+
 def _nominal(key: str, value: Any) -> NominalFiles:
-    return NominalFiles(**_checked("[nominal]", _table(key, value), _NOMINAL))
+    return NominalFiles(**_checked("[nominal]", _table(key, value), NominalFiles))
 
 
 def _anomalous(key: str, value: Any) -> dict[str, AnomalousFiles]:
     tables = {}
     for name, table in _table(key, value).items():
-        where = f"[anomalous.{name}]"
-        content = _checked(where, _table(where, table), _ANOMALOUS)
+        source = f"[anomalous.{name}]"
+        content = _checked(source, _table(source, table), AnomalousFiles)
         if name in ANOMALIES:
             content.setdefault("group", ANOMALIES[name].group)
         tables[name] = AnomalousFiles(**content)
     return tables
 
 
-_Readers = Mapping[str, Callable[[str, Any], Any]]
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """A recipe that makes one environment of a split from logs.
 
-_WINDOW: Final = _whole(2, also=0)
-_ROW: Final = _whole(0)
+    Parameters
+    ----------
+    split, environment
+        Names of both.
+    source, licence, citation
+        Where the logs are from.
+    time
+        Column with time stamps, ``NAME[s]``, ``[ms]``, ``[us]`` or ``[ns]``, or ISO 8601; empty for
+        the format's own, or none.
+    rate
+        Rows in a second of the result, to which rows are resampled, the last value held; None for
+        rows as they are.
+    gap
+        Seconds without a row beyond which a recording is cut; None refuses long gaps, and 0, for
+        scans, cuts there.
+    sensors, actions
+        Globs over columns or ``topic.field``, in order; ``"new = old"`` renames, ``NAME[UNIT]``
+        names the unit. Without sensors, the columns ``obs:NAME[UNIT]`` and ``action:NAME[UNIT]``.
+    reward
+        Column with rewards.
+    discrete
+        Number of actions, or their names, where each action is a whole number from 0 on.
+    angles
+        Globs of sensors that are replaced by their sine and cosine.
+    constant
+        What becomes of sensors that are constant in the training part: ``"keep"`` or ``"drop"``.
+    missing
+        What missing values do: ``"refuse"``, ``"hold"`` the last value, or ``"drop"`` the row.
+    missing_rows
+        Most rows in a run that are held or dropped.
+    labels
+        Columns that are nominal where they are 0, empty, false, ``"H"`` or `nominal_label`.
+    nominal_label
+        Values of the labels of nominal rows, in place of these.
+    intervals
+        Anomalous rows, or times, of files.
+    onset, stop
+        First anomalous row of each anomalous file, and the row after the last, if always the same.
+    outcome
+        Field, or column, that is true of episodes that succeeded: others are anomalous.
+    kinds
+        Field, or column, whose value names the anomaly of each episode.
+    task
+        Field, or column, with the task or set point of each episode.
+    baseline
+        Number of rows at the start of every episode that are nominal and not judged; 0 for none.
+    window
+        Rows to which longer recordings are cut; 0 for whole recordings.
+    clock
+        Whether row t of one episode may be compared with row t of another.
+    order
+        Whether parts follow one another as recorded, or episodes are shuffled before.
+    seed
+        Of the shuffling.
+    paired
+        Whether each anomalous episode has a nominal twin in a file of the same name.
+    format
+        Format of the files; empty to tell by their endings.
+    options
+        Of the format's reader.
+    nominal
+        Where nominal episodes are.
+    anomalous
+        Where anomalous episodes are, by the name of the anomaly.
+    """
 
-_NOMINAL: Final[_Readers] = {
-    **dict.fromkeys(("files", "train", "calibration", "test", "twins"), _globs),
-    "parts": _shares,
-    "where": _conditions,
-    "window": _WINDOW,
-}
-_ANOMALOUS: Final[_Readers] = {
-    "files": _globs,
-    "group": _choice(*GROUPS),
-    "where": _conditions,
-    "labels": _texts,
-    "onset": _ROW,
-    "stop": _whole(1),
-    "window": _WINDOW,
-}
-_READERS: Final[_Readers] = {
-    **dict.fromkeys(("split", "environment", "source", "licence", "citation", "time"), _text),
-    **dict.fromkeys(("reward", "outcome", "kinds", "task"), _text),
-    **dict.fromkeys(("rate", "gap"), _number),
-    **dict.fromkeys(("sensors", "actions", "angles", "labels"), _texts),
-    **dict.fromkeys(("clock", "paired"), _flag),
-    **dict.fromkeys(("onset", "missing_rows", "seed"), _ROW),
-    "stop": _whole(1),
-    "discrete": _discrete,
-    "constant": _choice("keep", "drop"),
-    "missing": _choice("refuse", "hold", "drop"),
-    "nominal_label": _scalars,
-    "intervals": _intervals,
-    "baseline": _whole(2, also=0),
-    "window": _WINDOW,
-    "order": _choice("recorded", "shuffled"),
-    "read": _table,
-    "nominal": _nominal,
-    "anomalous": _anomalous,
-}
+    split: Text
+    environment: Text
+    source: Text = ""
+    licence: Text = ""
+    citation: Text = ""
+    time: Text = ""
+    rate: Number = None
+    gap: Number = None
+    sensors: Texts = ()
+    actions: Texts = ()
+    reward: Text = ""
+    discrete: Annotated[int | tuple[str, ...], _discrete] = 0
+    angles: Texts = ()
+    constant: Annotated[Literal["keep", "drop"], _choice("keep", "drop")] = "keep"
+    missing: Annotated[Missing, _choice("refuse", "hold", "drop")] = "refuse"
+    missing_rows: Whole = MISSING_ROWS
+    labels: Texts = ()
+    nominal_label: Annotated[tuple[Any, ...], _scalars] = ()
+    intervals: Annotated[str | tuple[Interval, ...], _intervals] = ()
+    onset: Row = None
+    stop: Stop = None
+    outcome: Text = ""
+    kinds: Text = ""
+    task: Text = ""
+    baseline: Length = 0
+    window: Length = 0
+    clock: Flag = True
+    order: Annotated[Order, _choice("recorded", "shuffled")] = "recorded"
+    seed: Whole = 0
+    paired: Flag = False
+    format: str = ""
+    options: Mapping[str, Any] = field(default_factory=dict)
+    nominal: Annotated[NominalFiles, _nominal] = field(default_factory=NominalFiles)
+    anomalous: Annotated[Mapping[str, AnomalousFiles], _anomalous] = field(default_factory=dict)
+
+    @property
+    def label_columns(self) -> tuple[str, ...]:
+        """Columns with labels, of all anomalies."""
+        further = (column for table in self.anomalous.values() for column in table.labels)
+        return tuple(dict.fromkeys([*self.labels, *further]))
+
+    @classmethod
+    def load(cls, path: Path) -> "Recipe":
+        """Read a recipe.
+
+        Parameters
+        ----------
+        path
+            A TOML file.
+
+        Returns
+        -------
+        Recipe
+
+        Raises
+        ------
+        UsageError
+            When the file cannot be read or is no recipe; the message names the key.
+        """
+        return cls.parse(read_toml(path, UsageError), str(path))
+
+    @classmethod
+    def parse(cls, content: Mapping[str, Any], source: str = "the recipe") -> "Recipe":
+        """Check the content of a recipe.
+
+        Parameters
+        ----------
+        content
+            Keys and tables as in TOML.
+        source
+            What messages call it.
+
+        Returns
+        -------
+        Recipe
+
+        Raises
+        ------
+        UsageError
+            For an unknown or wrong key, with the nearest one, or keys that contradict each other.
+        """
+        values = _checked(source, content, cls)
+        if "split" not in values:
+            raise UsageError(f"{source} lacks the key 'split', the name of the split to make")
+        options = dict(values.pop("read", {}))
+        files = {"format": _text("[read]: format", options.pop("format", "")), "options": options}
+        recipe = cls(**{"environment": values["split"]} | values | files)
+        recipe.check(source)
+        return recipe
+
+    def check(self, source: str = "the recipe") -> None:
+        """Raise `UsageError` when names are taken or wrong, or keys contradict each other.
+
+        Parameters
+        ----------
+        source
+            What messages call the recipe.
+
+        Raises
+        ------
+        UsageError
+            With the key and what to do.
+        """
+        for kind, reserved, name in (
+            ("split", SPLITS, self.split),
+            ("environment", ENVIRONMENTS, self.environment),
+        ):
+            if name in reserved:
+                raise UsageError(f"{name!r} is the benchmark's {kind}: choose a name of your own")
+            check_name(kind, name)
+        for name, table in self.anomalous.items():
+            check_name("anomaly", name)
+            if name == "nominal":
+                raise UsageError(f"{source}: 'nominal' cannot be the name of an anomaly")
+            check_known("group", GROUPS, table.group)
+            if name in ANOMALIES and ANOMALIES[name].group != table.group:
+                shipped = ANOMALIES[name].group
+                raise UsageError(f"{name!r} is a {shipped} anomaly of the benchmark: rename it")
+        nominal = self.nominal
+        if not (nominal.files or nominal.train):
+            raise UsageError(f"{source}: [nominal] names neither files nor train, expected one")
+        if nominal.files and (nominal.train or nominal.calibration):
+            raise UsageError(
+                f"{source}: [nominal] has both files and parts of its own: name either files with "
+                "their shares, or train, calibration and test"
+            )
+        if nominal.train and not nominal.calibration:
+            raise UsageError(
+                f"{source}: [nominal] names train, but no calibration, which thresholds need"
+            )
+        if self.paired:
+            self._check_paired(source)
+        elif nominal.twins:
+            raise UsageError(f"{source}: [nominal] names twins, expected paired = true with them")
+        if self.gap is not None and not self.time and self.rate is None:
+            raise UsageError(f"{source}: gap needs stamps: name their column with time")
+        if self.stop is not None and self.onset is None:
+            raise UsageError(f"{source}: stop is the end of what onset begins: name onset, too")
+
+    def _check_paired(self, source: str) -> None:
+        if self.anomalous and not self.nominal.twins:
+            raise UsageError(
+                f"{source}: paired = true needs [nominal] twins: nominal episodes, each of which "
+                "has the file name of the anomalous one that it is compared with"
+            )
+        for key in ("window", "baseline", "outcome", "kinds", "task"):
+            if getattr(self, key):
+                raise UsageError(f"{source}: paired = true and {key} exclude each other")
 
 
-def _checked(source: str, content: Mapping[str, Any], readers: _Readers) -> dict[str, Any]:
+_Reader = Callable[[str, Any], Any]
+
+
+def _readers(table: type) -> dict[str, _Reader]:
+    """Return the readers of a table's keys, which stand beside their types, by key."""
+    hints = get_type_hints(table, include_extras=True)
+    return {
+        key: hint.__metadata__[0] for key, hint in hints.items() if get_origin(hint) is Annotated
+    }
+
+
+def _checked(source: str, content: Mapping[str, Any], table: type) -> dict[str, Any]:
     """Return the values of keys, each checked by its reader; unknown keys are errors."""
+    readers = _readers(table) | ({"read": _table} if table is Recipe else {})
     check_known(f"key of {source}", readers, *content)
     return {key: readers[key](f"{source}: {key}", value) for key, value in content.items()}
 
 
-KEYS: Final = ("read", *(f.name for f in fields(Recipe) if f.name not in {"format", "options"}))
+KEYS: Final = ("read", *_readers(Recipe))
 """Keys of a recipe, in the order in which one is written."""
