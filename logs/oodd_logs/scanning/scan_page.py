@@ -80,19 +80,24 @@ def page(scan: Scan, title: str = "Scan") -> str:
     str
         A whole document.
     """
-    heading = html.escape(title)
-    odd = scan.odd
+    heading, odd = html.escape(title), [i for i, one in enumerate(scan.episodes) if one.odd]
     head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width">'
     text = [
         f'<!doctype html><html lang="en"><head>{head}<title>{heading}</title>',
         f"<style>{_STYLE}</style></head><body><h1>{heading}</h1>",
         f"<p><strong>{summary(scan)}</strong> Judged by {html.escape(scan.judge)}.</p>",
         *(f'<p class="dim">{html.escape(note)}</p>' for note in scan.notes),
+        *([f'<p class="dim">{_LEGEND}</p>'] if odd else []),
     ]
-    if odd:
-        text.append(f'<p class="dim">{_LEGEND}</p>')
-    numbered = [(one, i) for i, one in enumerate(scan.episodes) if one.odd]
-    text += [_section(one, i, scan.sensors) for one, i in numbered[:PICTURES]]
+    for i in odd[:PICTURES]:
+        one = scan.episodes[i]
+        about = html.escape(describe(one))
+        if one.label:
+            about += f' <span class="dim">The logs say: {html.escape(one.label)}.</span>'
+        text.append(
+            f'<h2 id="episode-{i}">{html.escape(one.episode.name)}</h2><p>{about}</p>'
+            f'<div class="wide">{picture(one, scan.sensors)}</div>'
+        )
     if len(odd) > PICTURES:
         text.append(f"<p>And {len(odd) - PICTURES} more odd episodes without a picture.</p>")
     text.append(f"<h2>All episodes</h2>{_table(scan.episodes)}")
@@ -101,21 +106,16 @@ def page(scan: Scan, title: str = "Scan") -> str:
 
 def _table(episodes: Sequence[ScannedEpisode]) -> str:
     names = titles(episodes)
-    heads = "".join(f"<th{' class=number' * (title in NUMBERS)}>{title}</th>" for title in names)
-    lines = []
-    for number, one in enumerate(episodes):
+    lines = ["".join(f"<th{' class=number' * (name in NUMBERS)}>{name}</th>" for name in names)]
+    for i, one in enumerate(episodes):
         name, *others = map(html.escape, cells(one))
-        link = f'<a href="#episode-{number}">{name}</a>' if one.odd else name
-        lines.append(
-            f"<tr{' class=odd' * one.odd}><td>{link}</td>"
-            + "".join(
-                f"<td class={'number' if title in NUMBERS else 'words'}>{text}</td>"
-                for title, text in zip(names[1:], others, strict=False)
-            )
-            + "</tr>"
-        )
-    body = "\n".join(lines)
-    return f'<div class="wide"><table><tr>{heads}</tr>\n{body}</table></div>'
+        line = f'<td><a href="#episode-{i}">{name}</a></td>' if one.odd else f"<td>{name}</td>"
+        for title, text in zip(names[1:], others, strict=False):
+            line += f"<td class={'number' if title in NUMBERS else 'words'}>{text}</td>"
+        lines.append(line)
+    odd = [False, *(one.odd for one in episodes)]
+    rows = [f"<tr{' class=odd' * o}>{line}</tr>" for o, line in zip(odd, lines, strict=True)]
+    return f'<div class="wide"><table>{chr(10).join(rows)}</table></div>'
 
 
 def titles(episodes: Sequence[ScannedEpisode]) -> tuple[str, ...]:
@@ -138,16 +138,6 @@ def cells(one: ScannedEpisode, *, brief: bool = False) -> list[str]:
         ", ".join(faults),
         one.label,
     ]
-
-
-def _section(one: ScannedEpisode, number: int, names: Sequence[str]) -> str:
-    about = html.escape(describe(one))
-    if one.label:
-        about += f' <span class="dim">The logs say: {html.escape(one.label)}.</span>'
-    return (
-        f'<h2 id="episode-{number}">{html.escape(one.episode.name)}</h2><p>{about}</p>'
-        f'<div class="wide">{picture(one, names)}</div>'
-    )
 
 
 def summary(scan: Scan) -> str:
@@ -177,29 +167,30 @@ def picture(one: ScannedEpisode, names: Sequence[str]) -> str:
     """Return the statistic with its threshold, and suspected sensors around the first odd row."""
     columns = {name: one.episode.observations[:, d] for d, name in enumerate(names)}
     suspects = [name for name in [*one.suspects, *one.sensors, *names] if name in columns]
-    chosen = list(dict.fromkeys(suspects))[:SENSORS]
-    height = _TALL + _GAP + len(chosen) * (_LOW + _GAP)
-    first = one.first or 0
-    begin, end = max(0, first - AROUND), min(len(one.scores), first + AROUND + 1)
-    parts = [_statistic(one)]
-    for i, name in enumerate(chosen):
-        top = _TALL + _GAP + i * (_LOW + _GAP)
-        parts.append(_panel(columns[name], name, top, _LOW, begin, end, one))
-    label = html.escape(f"Statistic and sensors of {one.episode.name}")
-    return (
-        f'<svg viewBox="0 0 {_WIDTH} {height}" role="img" aria-label="{label}">'
-        + "".join(parts)
-        + "</svg>"
-    )
-
-
-def _statistic(one: ScannedEpisode) -> str:
-    values = np.where(np.isfinite(one.statistic), one.statistic, np.nan)
-    name, limit = "statistic", one.threshold
+    first, rows = one.first or 0, len(one.scores)
+    around = range(max(0, first - AROUND), min(rows, first + AROUND + 1))
+    statistic = np.where(np.isfinite(one.statistic), one.statistic, np.nan)
+    title, limit = "statistic", one.threshold
     if 0 < limit * LOGARITHMIC < one.largest < math.inf:
-        values = np.log10(np.maximum(values, limit / 1e3))
-        name, limit = "statistic (log)", math.log10(limit)
-    return _panel(values, name, 0, _TALL, 0, len(values), one, limit)
+        statistic = np.log10(np.maximum(statistic, limit / 1e3))
+        title, limit = "statistic (log)", math.log10(limit)
+    panels = [_panel(statistic, title, 0, _TALL, range(rows), one, limit)]
+    height = _TALL + _GAP
+    for name in list(dict.fromkeys(suspects))[:SENSORS]:
+        panels.append(_panel(columns[name], name, height, _LOW, around, one))
+        height += _LOW + _GAP
+    label = html.escape(f"Statistic and sensors of {one.episode.name}")
+    box = f'viewBox="0 0 {_WIDTH} {height}"'
+    return f'<svg {box} role="img" aria-label="{label}">{"".join(panels)}</svg>'
+
+
+def _tag(name: str, content: str | None = None, **attributes: str | float) -> str:
+    """Return an element; numbers with a point get one decimal."""
+    tag = f"<{name}"
+    for key, value in attributes.items():
+        text = f"{value:.1f}" if isinstance(value, float) else value
+        tag += f' {key.strip("_").replace("_", "-")}="{text}"'
+    return tag + ("/>" if content is None else f">{content}</{name}>")
 
 
 def _panel(
@@ -207,60 +198,49 @@ def _panel(
     name: str,
     top: int,
     height: int,
-    begin: int,
-    end: int,
+    rows: range,
     one: ScannedEpisode,
     limit: float = math.nan,
 ) -> str:
-    """Return a curve of the rows from `begin` to `end` in its frame, with limit and odd rows."""
-    top += 18
-    visible = values[begin:end]
-    finite = np.append(visible[np.isfinite(visible)], limit if math.isfinite(limit) else [])
+    """Return a curve of some rows in its frame, with limit and odd rows."""
+    top, begin, end = top + 18, rows.start, rows.stop
+    visible, is_limited = values[begin:end], math.isfinite(limit)
+    finite = np.append(visible[np.isfinite(visible)], limit if is_limited else [])
     low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 1.0)
     if low == high:
         low, high = low - 1, high + 1
-    width = _WIDTH - _LEFT - _RIGHT
+    width, right, bottom = _WIDTH - _LEFT - _RIGHT, _WIDTH - _RIGHT, top + height
 
     def x(row: float) -> float:
         return _LEFT + width * (row - begin) / max(1, end - begin - 1)
 
     def y(value: float) -> float:
-        return top + height - 4 - (height - 8) * (value - low) / (high - low)
+        return bottom - 4 - (height - 8) * (value - low) / (high - low)
 
-    parts = []
-    for start, stop in one.intervals:
-        a, b = max(start, begin), min(stop, end)
-        if a < b:
-            parts.append(
-                f'<rect class="shade" x="{x(a):.1f}" y="{top}" '
-                f'width="{max(1.0, x(b - 1) - x(a)):.1f}" height="{height}"/>'
-            )
-    parts.append(f'<rect class="frame" x="{_LEFT}" y="{top}" width="{width}" height="{height}"/>')
-    if math.isfinite(limit):
-        at = f'y1="{y(limit):.1f}" y2="{y(limit):.1f}"'
-        parts.append(f'<line class="limit" x1="{_LEFT}" x2="{_LEFT + width}" {at}/>')
-    if one.first is not None and begin <= one.first < end:
-        at = f'x1="{x(one.first):.1f}" x2="{x(one.first):.1f}"'
-        parts.append(f'<line class="first" y1="{top}" y2="{top + height}" {at}/>')
+    def text(at: float, line: float, content: str, anchor: str = "end") -> str:
+        return _tag("text", content, x=at, y=line, text_anchor=anchor)
+
+    parts = [
+        _tag("rect", class_="shade", x=x(a), y=top, width=max(1.0, x(b - 1) - x(a)), height=height)
+        for start, stop in one.intervals
+        if (a := max(start, begin)) < (b := min(stop, end))
+    ]
+    parts.append(_tag("rect", class_="frame", x=_LEFT, y=top, width=width, height=height))
+    if is_limited:
+        parts.append(_tag("line", class_="limit", x1=_LEFT, x2=right, y1=y(limit), y2=y(limit)))
+    if one.first is not None and one.first in rows:
+        at = x(one.first)
+        parts.append(_tag("line", class_="first", y1=top, y2=bottom, x1=at, x2=at))
     for run in runs_of(np.isfinite(visible)):
         points = " ".join(f"{x(begin + r):.1f},{y(v):.1f}" for r, v in _thinned(visible, *run))
-        parts.append(f'<polyline class="curve" points="{points}"/>')
-    power = "log" in name
-    ticks = [(top + 12, high), (top + height - 4, low)]
-    parts += [
-        f'<text x="{_LEFT - 6}" y="{at}" text-anchor="end">{figure(10**v if power else v)}</text>'
-        for at, v in ticks
-    ]
-    parts.append(f'<text class="name" x="{_LEFT}" y="{top - 5}">{html.escape(name)}</text>')
-    if math.isfinite(limit):
-        parts.append(
-            f'<text x="{_LEFT + width}" y="{top - 5}" text-anchor="end">'
-            f"dashed: threshold {figure(one.threshold)}</text>"
-        )
-    parts += [
-        f'<text x="{at:.1f}" y="{top + height + 13}" text-anchor="{anchor}">row {row}</text>'
-        for at, anchor, row in ((_LEFT, "start", begin), (_LEFT + width, "end", end - 1))
-    ]
+        parts.append(_tag("polyline", class_="curve", points=points))
+    for line, value in ((top + 12, high), (bottom - 4, low)):
+        parts.append(text(_LEFT - 6, line, figure(10**value if "log" in name else value)))
+    parts.append(_tag("text", html.escape(name), class_="name", x=_LEFT, y=top - 5))
+    if is_limited:
+        parts.append(text(right, top - 5, f"dashed: threshold {figure(one.threshold)}"))
+    parts.append(text(float(_LEFT), bottom + 13, f"row {begin}", "start"))
+    parts.append(text(float(right), bottom + 13, f"row {end - 1}"))
     return "".join(parts)
 
 
