@@ -1,7 +1,6 @@
 """Facts of one recording by its recipe: values that hold for all of it, stamps, anomalous rows."""
 
 import dataclasses
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -14,7 +13,7 @@ from oodd_eval.errors import TrajectoryError, UnknownNameError, UsageError
 from oodd_logs.marks import IntervalList, Mark, anomalous_cells, runs_of
 from oodd_logs.readers.cells import first_text
 from oodd_logs.recipe import Recipe, anomaly_name
-from oodd_logs.recording import Recording, Topic, parse_times
+from oodd_logs.recording import Recording, parse_times
 from oodd_logs.rows import Tally, TopicRows, read_column
 from oodd_logs.selecting import Selection, find_columns, layout_of, named_columns
 from oodd_logs.stamps import (
@@ -246,10 +245,15 @@ class StampedRows:
         marks = []
         for text, column in self._selection.labels.items():
             owners = [name for name, table in recipe.anomalous.items() if text in table.labels]
-            topic = recorded.recording.topics[column.topic]
+            blocks = [np.zeros(0, np.bool_)]
+            for _start, cells in read_column(
+                recorded.recording.topics[column.topic], column.column
+            ):
+                before = bool(blocks[-1][-1:].any())
+                blocks.append(anomalous_cells(cells, recipe, before=before))
             marks += [
                 self._mark(start, stop, kind, column.topic)
-                for start, stop in _labelled(topic, column.column, recipe)
+                for start, stop in runs_of(np.concatenate(blocks))
                 for kind in ([""] if text in recipe.labels else owners)
             ]
         for _, start, stop, kind in intervals.of_recording(
@@ -314,12 +318,3 @@ def _seconds(cells: NDArray[Any], unit: str, source: str) -> Times:
         return parse_times(cells, "" if cells.dtype.kind == "U" else unit_of(unit))
     except (TrajectoryError, UsageError) as error:
         raise TrajectoryError(f"{source}: {error}") from None
-
-
-def _labelled(topic: Topic, column: str, recipe: Recipe) -> Iterable[tuple[int, int]]:
-    """Return the runs of anomalous rows by a column with labels."""
-    blocks: list[NDArray[np.bool_]] = []
-    for _start, cells in read_column(topic, column):
-        before = bool(blocks and blocks[-1][-1])
-        blocks.append(anomalous_cells(cells, recipe, before=before))
-    return runs_of(np.concatenate(blocks)) if blocks else []

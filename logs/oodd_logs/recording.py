@@ -73,7 +73,10 @@ class Topic:
         TrajectoryError
             When lengths differ.
         """
-        arrays = {name: _column(values) for name, values in columns.items()}
+        arrays = {name: np.asarray(values) for name, values in columns.items()}
+        for name, array in arrays.items():
+            if array.dtype.kind != "U":
+                arrays[name] = np.asarray(array, np.float64)
         lengths = {name: len(values) for name, values in arrays.items()}
         if len({*lengths.values()}) > 1:
             raise TrajectoryError(f"columns have lengths {lengths}, expected equal ones")
@@ -107,11 +110,6 @@ class Recording:
     source: str
     topics: Mapping[str, Topic]
     fields: Mapping[str, Any] = field(default_factory=dict)
-
-
-def _column(values: Any) -> Column:
-    array = np.asarray(values)
-    return array if array.dtype.kind == "U" else np.asarray(array, np.float64)
 
 
 def parse_times(column: Column, unit: str = "") -> NDArray[np.float64]:

@@ -87,6 +87,7 @@ class TopicRows:
         self, recording: Recording, name: str, selection: Selection, recipe: Recipe, tally: Tally
     ) -> None:
         self._topic, self._source = recording.topics[name], recording.source
+        self._count = self._topic.rows
         rewards = (selection.reward,) if selection.reward else ()
         columns = (*selection.sensors, *selection.actions, *rewards)
         self.indices = [i for i, column in enumerate(columns) if column.topic == name]
@@ -100,11 +101,6 @@ class TopicRows:
         self._runs = np.zeros(len(self._columns), np.int64)
         self._step = max(64, _CELLS // max(1, len(self._columns)))
 
-    @property
-    def count(self) -> int:
-        """Number of rows of the topic."""
-        return self._topic.rows
-
     def usable(self) -> NDArray[np.int64]:
         """Return the numbers of the rows that missing values leave.
 
@@ -114,20 +110,20 @@ class TopicRows:
             When more rows in a run are dropped than the recipe allows.
         """
         if self._policy == "refuse":
-            return np.arange(self.count)
+            return np.arange(self._count)
         firsts = np.full(len(self._columns), -1)
-        complete = np.zeros(self.count, bool)
-        for start in range(0, self.count, self._step):
-            present = np.isfinite(self._cells(start, min(start + self._step, self.count)))
+        complete = np.zeros(self._count, bool)
+        for start in range(0, self._count, self._step):
+            present = np.isfinite(self._cells(start, min(start + self._step, self._count)))
             now = (firsts < 0) & present.any(axis=0)
             firsts[now] = start + present.argmax(axis=0)[now]
-            present[-1:] |= self._may_end & (start + len(present) == self.count)
+            present[-1:] |= self._may_end & (start + len(present) == self._count)
             complete[start : start + len(present)] = present.all(axis=1)
             if self._policy != "drop" and firsts.min(initial=0) >= 0:
                 break
         lacking = [name for name, row in zip(self._columns, firsts, strict=True) if row < 0]
         if self._policy == "keep" and lacking:  # for the scan to say
-            return np.arange(self.count)
+            return np.arange(self._count)
         kept = np.flatnonzero(complete)
         if lacking or (self._policy == "drop" and not len(kept)):
             what = f"column {lacking[0]!r} has no value" if lacking else "no row has all values"
@@ -137,12 +133,12 @@ class TopicRows:
         if self._policy != "drop":
             first = self._position = int(firsts.max(initial=0))
             self._tally.add("leading rows with missing values dropped", first, self._source)
-            return np.arange(first, self.count)
+            return np.arange(first, self._count)
         dropped = np.diff(kept) - 1
         if dropped.max(initial=0) > self._most:
             row = int(kept[int(dropped.argmax())]) + 1
             raise self._too_long(row, "", int(dropped.max()))
-        self._tally.add("rows with missing values dropped", self.count - len(kept), self._source)
+        self._tally.add("rows with missing values dropped", self._count - len(kept), self._source)
         return kept
 
     def rows(self, numbers: NDArray[np.int64]) -> Matrix:
@@ -162,7 +158,11 @@ class TopicRows:
         while self._position < end:
             start, stop = self._position, min(self._position + self._step, end)
             cells = self._cells(start, stop)
-            self._fill_end(cells, stop)
+            if stop == self._count:
+                # Actions and rewards that the last row lacks are those of the row before.
+                before = cells[-2] if len(cells) > 1 else self._last
+                ends = self._may_end & ~np.isfinite(cells[-1])
+                cells[-1, ends] = np.nan_to_num(before[ends])
             if self._policy in {"refuse", "hold"}:
                 self._fill(cells, start)
             upto = int(np.searchsorted(numbers, stop))
@@ -170,13 +170,6 @@ class TopicRows:
             done, self._position = upto, stop
             self._last = cells[-1].copy()
         return out
-
-    def _fill_end(self, cells: Matrix, stop: int) -> None:
-        """Give actions and rewards that are missing in the last row of all the values before."""
-        if stop == self.count:
-            before = cells[-2] if len(cells) > 1 else self._last
-            ends = self._may_end & ~np.isfinite(cells[-1])
-            cells[-1, ends] = np.nan_to_num(before[ends])
 
     def _fill(self, cells: Matrix, start: int) -> None:
         """Replace missing values by the last ones, or refuse them."""
@@ -217,18 +210,14 @@ class TopicRows:
         cells = self._topic.read(self._unique, start, stop)
         for name, values in cells.items():
             if values.dtype.kind == "U":
-                raise _text_error(self._source, name, values, start)
+                row, distinct = first_text(values.tolist()), dict.fromkeys(values.tolist())
+                texts = [repr(text) for text in distinct if numbers([text]) is None][:4]
+                raise TrajectoryError(
+                    f"{self._source}, row {start + row}, column {name!r} is "
+                    f"{str(values[row])!r:.60}, expected a number: it holds texts such as "
+                    f"{', '.join(texts)}; leave it out, or name it under labels"
+                )
         return np.stack([cells[name] for name in self._columns], axis=1).astype(np.float64)
-
-
-def _text_error(source: str, column: str, values: NDArray[Any], start: int) -> TrajectoryError:
-    """Return the error for a column that holds text."""
-    row = first_text(values.tolist())
-    texts = [repr(text) for text in dict.fromkeys(values.tolist()) if numbers([text]) is None][:4]
-    return TrajectoryError(
-        f"{source}, row {start + row}, column {column!r} is {str(values[row])!r:.60}, expected a "
-        f"number: it holds texts such as {', '.join(texts)}; leave it out, or name it under labels"
-    )
 
 
 class Converter:

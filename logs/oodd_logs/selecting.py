@@ -110,10 +110,8 @@ def find_columns(layout: Layout, text: str) -> list[ChosenColumn]:
         if len(columns) > 1:
             raise UsageError(f"{text!r} renames {len(columns)} columns, expected exactly one")
         name, unit = _named_unit(new)
-        columns = [
-            ChosenColumn(c.topic, c.column, Quantity(name, unit or c.quantity.unit))
-            for c in columns
-        ]
+        for c in columns:
+            return [ChosenColumn(c.topic, c.column, Quantity(name, unit or c.quantity.unit))]
     return columns
 
 
@@ -150,23 +148,21 @@ def select_columns(layout: Layout, recipe: Recipe, source: str) -> Selection:
     if recipe.reward:
         rewards = _listed(layout, (recipe.reward,), source)
     for kind, columns in (("sensors", sensors), ("actions", actions)):
-        _check_distinct(source, kind, columns)
+        names = [column.quantity.name for column in columns]
+        if double := [name for name in names if names.count(name) > 1]:
+            advice = "rename one, 'new = old'"
+            raise UsageError(f"{source} has two {kind} named {double[0]!r}: {advice}")
     tables = [recipe.nominal.where, *(table.where for table in recipe.anomalous.values())]
-    others = [recipe.outcome, recipe.kinds, recipe.task, *(key for t in tables for key in t)]
-    fields = [column for text in filter(None, others) for column in find_columns(layout, text)]
+    texts = [recipe.outcome, recipe.kinds, recipe.task, *(key for t in tables for key in t)]
+    fields = [column for text in filter(None, texts) for column in find_columns(layout, text)]
     labels = {
         text: column for text in recipe.label_columns for column in find_columns(layout, text)[:1]
     }
     used = [*sensors, *actions, *rewards[:1], *labels.values()]
     times = _times(layout, dict.fromkeys(column.topic for column in used), recipe.time, source)
-    used += fields
-    named = {(c.topic, c.column) for c in (*used, *times.values())}
-    unused = tuple(
-        _aliases(topic, name)[-1]
-        for topic, columns, _ in layout
-        for name in columns
-        if (topic, name) not in named
-    )
+    named = {(c.topic, c.column) for c in (*used, *fields, *times.values())}
+    columns_ = [(topic, name) for topic, names, _ in layout for name in names]
+    unused = tuple(_aliases(*column)[-1] for column in columns_ if column not in named)
     if by_prefix:
         _check_spelling(source, unused)
     reward = rewards[0] if rewards else None
@@ -175,15 +171,14 @@ def select_columns(layout: Layout, recipe: Recipe, source: str) -> Selection:
 
 def unnamed_columns(layout: Layout, recipe: Recipe) -> tuple[str, ...]:
     """Return the columns that no key of a recipe without sensors names; none with ``obs:`` ones."""
-    names = [(topic, name) for topic, columns, _ in layout for name in columns]
-    if any((match := _PREFIX.match(name)) and match[1].lower() == "obs" for _, name in names):
+    columns = [(topic, name) for topic, names, _ in layout for name in names]
+    if any((match := _PREFIX.match(name)) and match[1].lower() == "obs" for _, name in columns):
         return ()
     keys = (recipe.reward, recipe.time, recipe.outcome, recipe.kinds, recipe.task)
     texts = [*recipe.actions, *recipe.label_columns, *filter(None, keys)]
     named = {(c.topic, c.column) for text in texts for c in find_columns(layout, text)}
-    return tuple(
-        f"{topic}.{name}" if topic else name for topic, name in names if (topic, name) not in named
-    )
+    unnamed = (column for column in columns if column not in named)
+    return tuple(f"{topic}.{name}" if topic else name for topic, name in unnamed)
 
 
 def _by_prefix(
@@ -228,12 +223,6 @@ def _listed(layout: Layout, texts: Sequence[str], source: str) -> list[ChosenCol
         for column in columns:
             chosen.setdefault((column.topic, column.column), column)
     return list(chosen.values())
-
-
-def _check_distinct(source: str, kind: str, columns: Sequence[ChosenColumn]) -> None:
-    names = [column.quantity.name for column in columns]
-    if double := [name for name in names if names.count(name) > 1]:
-        raise UsageError(f"{source} has two {kind} named {double[0]!r}: rename one, 'new = old'")
 
 
 def _times(
@@ -283,7 +272,7 @@ def _matches(layout: Layout, text: str) -> list[ChosenColumn]:
             _with_unit(topic, name, unit)
             for topic, names, _ in layout
             for name in names
-            if any(glob.fullmatch(alias) for alias in _aliases(topic, name))
+            if any(map(glob.fullmatch, _aliases(topic, name)))
         ]
         if columns:
             return columns
@@ -292,8 +281,7 @@ def _matches(layout: Layout, text: str) -> list[ChosenColumn]:
 
 def _with_unit(topic: str, column: str, unit: str) -> ChosenColumn:
     name = _aliases(topic, column)[-1]
-    match = _PREFIX.match(column)
-    known = (_named_unit if match else split_unit)(column)[1]
+    known = (_named_unit if _PREFIX.match(column) else split_unit)(column)[1]
     if unit not in {"", known} and known not in {"", "1"}:
         raise UsageError(
             f"column {column!r} is in {known}, and the recipe says {unit}: values are not converted"
