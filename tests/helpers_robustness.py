@@ -131,7 +131,7 @@ def run_here(home, arguments, capture):
     (home / "tmp").mkdir(exist_ok=True)
     capture.readouterr()
     signal.signal(signal.SIGALRM, _no_end)
-    signal.alarm(int(LIMIT))
+    signal.alarm(int(3 * LIMIT))  # beside other tests
     try:
         with chdir(home):
             code = main([str(argument) for argument in arguments])
