@@ -153,6 +153,11 @@ def test_an_entry_declares_the_row_that_is_ranked_for_its_detector():
     assert primary("riqn[h=10]") == {10}
     with pytest.raises(ResultsError, match="expected one row a detector"):
         primary("riqn", "riqn[h=10]")
+    # It has all cells of the usual row.
+    usual = [r for r in board() if r.detector != "rf"]
+    lacking = [r for r in usual if r.horizon == 1 or r.environment == "ant"]
+    with pytest.raises(ResultsError, match="lacks 2 cells that 'riqn' has"):
+        sections([entry("mine", lacking, primary=["riqn[h=10]"])])
 
 
 @pytest.mark.parametrize("whole", [False, True])
@@ -172,13 +177,6 @@ def test_a_stranger_does_not_choose_the_row_that_is_ranked(whole):
     assert {str(s.entry): s.rank for s in ranks.standings if s.primary} == {
         "riqn": 1, "persistence": 2, "clock": 3,
     }  # fmt: skip
-
-
-def test_a_declared_row_has_all_cells_of_the_usual_one():
-    records = [r for r in board() if r.detector != "rf"]
-    lacking = [r for r in records if r.horizon == 1 or r.environment == "ant"]
-    with pytest.raises(ResultsError, match="lacks 2 cells that 'riqn' has"):
-        sections([entry("mine", lacking, primary=["riqn[h=10]"])])
 
 
 @pytest.mark.parametrize("lacks", ["cells", "seeds"])
@@ -585,17 +583,6 @@ def test_build_writes_page_tables_and_site(tmp_path, capsys):
     assert "open `site/index.html`" in text
 
 
-def test_check_passes_on_what_was_built_and_writes_nothing(tmp_path, capsys):
-    _, results, output = built(tmp_path, entries())
-    before = files_below(output)
-    (output / "notes.txt").write_text("mine")
-    capsys.readouterr()
-    code = main(["leaderboard", "build", str(results), "--output", str(output), "--check"])
-    assert code == 0
-    assert "up to date" in capsys.readouterr().out
-    assert files_below(output) == before | {"notes.txt": b"mine"}
-
-
 def test_check_compares_what_compressed_files_say(tmp_path):
     _, results, output = built(tmp_path, entries())
     check = ["leaderboard", "build", str(results), "--output", str(output), "--check"]
@@ -625,16 +612,20 @@ def test_a_board_that_no_reader_would_unpack_is_written(tmp_path, monkeypatch):
     assert (tmp_path / PUBLISHED).is_file()
 
 
-def test_check_names_every_file_that_differs(tmp_path, capsys):
+def test_check_names_every_file_that_differs_and_writes_nothing(tmp_path, capsys):
     _, results, output = built(tmp_path, entries())
+    check = ["leaderboard", "build", str(results), "--output", str(output), "--check"]
+    before = files_below(output)
+    (output / "notes.txt").write_text("mine")
+    assert main(check) == 0
+    assert "up to date" in capsys.readouterr().out
+    assert files_below(output) == before | {"notes.txt": b"mine"}
     name = f"tables/mini-{'ab' * 6}-protocol1"
     (output / f"{name}-ranking.csv").write_text("rank\n")
     (output / f"{name}-comparisons.csv").unlink()
     (output / "tables" / "old.csv").write_text("")
     (output / "site" / "index.html").write_text("")
-    capsys.readouterr()
-    code = main(["leaderboard", "build", str(results), "--output", str(output), "--check"])
-    assert code == 1
+    assert main(check) == 1
     said = capsys.readouterr()
     assert said.out.splitlines() == [
         f"{name}-comparisons.csv: missing",
