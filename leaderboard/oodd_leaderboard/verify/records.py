@@ -36,9 +36,9 @@ def check_record(where: str, record: Record, findings: Findings) -> None:
     for name in record.per_trajectory:
         stored, terms = record.metrics[name], contribution(record, name)
         for field in ("value", "n"):
-            given, computed = getattr(stored, field), getattr(terms, field)
-            if not same(given, computed):
-                message = f"is {given}, but per_trajectory gives {computed}"
+            reported, computed = getattr(stored, field), getattr(terms, field)
+            if not same(reported, computed):
+                message = f"is {reported}, but per_trajectory gives {computed}"
                 findings.refuse(where, f"metrics.{name}.{field}", message)
     if record.paired and "auc_before" not in record.metrics and (why := early_difference(record)):
         findings.refuse(where, "per_trajectory", why)
