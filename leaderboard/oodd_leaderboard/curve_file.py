@@ -134,10 +134,8 @@ def strict_model(**types: Any) -> Any:
 
 @functools.cache
 def _layouts() -> tuple[TypeAdapter[Any], TypeAdapter[Any], TypeAdapter[Any]]:
-    """Return readers of the file, of a cell with twins, and of one without.
-
-    They know fields, types and ranges of single values.
-    """
+    """Return readers of the file, of a cell with twins, and of one without."""
+    # They know fields, types and ranges of single values.
 
     def numbers(item: Any) -> Any:
         return conlist(item, max_length=LONGEST)

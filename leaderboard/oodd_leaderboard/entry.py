@@ -287,11 +287,10 @@ def sections(entries: Sequence[SubmittedEntry]) -> list[LeaderboardSection]:
 
 
 def _primary(records: Sequence[Record], sources: Mapping[Setting, SubmittedEntry]) -> set[Setting]:
-    """Return the primary row of each detector: what its entry declares, else the usual one.
-
-    A declared row takes the place of another. So the entry has to be the only one with rows of the
-    detector, or it would push somebody else's row out of the ranking, and its row has to be whole.
-    """
+    """Return the primary row of each detector: what its entry declares, else the usual one."""
+    # A declared row takes the place of another. So the entry has to be the only one with rows of
+    # the detector, or it would push somebody else's row out of the ranking, and its row has to be
+    # whole.
     primary = {row.detector: row for row in primary_settings(records)}
     expected = expected_cells(records)
     by_row = grouped(records, lambda r: r.setting)

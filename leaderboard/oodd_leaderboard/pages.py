@@ -226,10 +226,8 @@ def _section(section: LeaderboardSection) -> str:
 
 
 def _verdict(ranks: RankedBoard) -> str:
-    """Return the sentence that comes first, and before it which rows share the first rank.
-
-    A single comparison of two rows is not corrected for all pairs of the board, as ranks are.
-    """
+    """Return the sentence that comes first, and before it which rows share the first rank."""
+    # A single comparison of two rows is not corrected for all pairs of the board, as ranks are.
     first = [str(s.entry) for s in ranks.standings if s.rank == 1 and s.primary]
     if len(first) < 2:
         return verdict_of(ranks.board)
@@ -275,10 +273,8 @@ def about_split(board: Board) -> str:
 
 
 def _of_paper(ranks: RankedBoard) -> list[Table]:
-    """Return what the paper's alarm does: means, and the layout of the paper's Table 5.
-
-    That has a column per row of the board, so that it is kept to rows with default parameters.
-    """
+    """Return what the paper's alarm does: means, and the layout of the paper's Table 5."""
+    # That has a column per row of the board, so that it is kept to rows with default parameters.
     records = [r for r in ranks.board.records if not r.overrides]
     as_in_the_paper = Tables(Board(records)).anomaly_groups() if records else []
     return [Tables(ranks.board, standings=ranks.standings).papers(), *as_in_the_paper]

@@ -1,7 +1,7 @@
 """The published board as one small file, and a run of one's own among its rows.
 
-``leaderboard build`` writes the file, the wheel ships it. It holds the records of all entries
-without what no ranking needs, as lines of JSON, compressed. Each record's provenance says which
+``leaderboard build`` writes the file, the wheel ships it. It holds each entry's records, reduced to
+what ranking needs, as lines of JSON, compressed. Each record's provenance says which
 entry it is from, and whether its row is primary. A run is placed by the code that ranks the board
 itself. Of further test suites with several strengths it has the table of detection thresholds.
 """

@@ -140,10 +140,8 @@ def _complete(records: Sequence[Record]) -> tuple[list[Record], list[str]]:
 
 
 def _publishable(record: Record) -> Record:
-    """Return a record whose texts are plain; a command that is not is left out.
-
-    Exceptions may say anything, and parameters on the command line may have any value.
-    """
+    """Return a record whose texts are plain; a command that is not is left out."""
+    # Exceptions may say anything, and parameters on the command line may have any value.
     reason = "".join(c if c.isprintable() else " " for c in record.reason)
     reason = reason.replace("<", "(").replace(">", ")").replace("](", "] (")[:1000]
     origin = dict(record.provenance)

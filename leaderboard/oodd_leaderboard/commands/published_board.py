@@ -185,10 +185,8 @@ def _rank(rank: int | None) -> str:
 
 
 def _shared(standing: Standing, standings: Sequence[Standing], kind: str) -> str:
-    """Return in brackets how many rows share a rank, and that it says nothing among trivial ones.
-
-    Trivial rows do not count beside a row that is trivial itself.
-    """
+    """Return in brackets how many rows share a rank; among trivial ones that says nothing."""
+    # Trivial rows do not count beside a row that is trivial itself.
     rank = getattr(standing, kind)
     same = [s for s in standings if rank and getattr(s, kind) == rank]
     if len(same) < 2:

@@ -129,10 +129,8 @@ def _run(
 
 @functools.cache
 def _may_be_nobody(readable: tuple[Path, ...]) -> bool:
-    """Tell whether the superuser's workers can be nobody, who has to be able to read the files.
-
-    Otherwise, as for other users, a worker has the user's number outside, and nobody's inside.
-    """
+    """Tell whether the superuser's workers can be nobody, who has to be able to read the files."""
+    # Otherwise, as for other users, a worker has the user's number outside, and nobody's inside.
     if os.geteuid() != 0 or not shutil.which("setpriv"):
         return False
     looks = ["/bin/sh", "-c", 'for path; do [ -r "$path" ] || exit 1; done', "sh"]

@@ -101,10 +101,8 @@ def part_name(text: str) -> str:
 
 
 def _power(section: SuiteSection) -> Json:
-    """Return tables of a board of graded strengths, and each row's means along the ladder.
-
-    Points are (strength, share of the return lost, value), the weakest strength first.
-    """
+    """Return tables of a board of graded strengths, and each row's means along the ladder."""
+    # Points are (strength, share of the return lost, value), the weakest strength first.
     board, tables = section.board, section.tables[:2]
     rows = {str(row): row for row in board.entries}
     records = grouped(board.records, lambda r: str(r.setting))
@@ -272,10 +270,8 @@ def _summaries(
     chosen: Mapping[str, Sequence[SelectedCell]],
     intervals: Json,
 ) -> dict[str, list[list[int | None]]]:
-    """Return means over the selections of the index: values, then low and high ends.
-
-    They are whole numbers of the last digit that is printed, None where there is none.
-    """
+    """Return means over the selections of the index: values, then low and high ends."""
+    # They are whole numbers of the last digit that is printed, None where there is none.
     board, summaries = section.ranks.board, {}
     for key in (key for key in SUMMARIES if key in chosen):
         means = [board.mean(standing.entry, *_sides(chosen[key]), name) for name in names]
@@ -308,10 +304,8 @@ def _mean(records: Sequence[Record], metric: str) -> float | None:
 def _ranking_intervals(
     part: Json, board: Board, names: Sequence[str]
 ) -> dict[str, list[float | None]]:
-    """Return a row's intervals of the metric that ranks by selection.
-
-    A cell of one record has its pair.
-    """
+    """Return a row's intervals of the metric that ranks by selection."""
+    # A cell of one record has its pair.
     with_ends = _with_intervals(names, board)
     if board.ranking not in with_ends:
         return {}
@@ -352,10 +346,8 @@ def _intervals(
     names: Sequence[str],
     chosen: Mapping[str, Sequence[SelectedCell]],
 ) -> Json:
-    """Intervals of means by key of the selection, in the order of the board's ``intervals``.
-
-    A single record has its own.
-    """
+    """Intervals of means by key of the selection, in the order of the board's ``intervals``."""
+    # A single record has its own.
     metrics = _with_intervals(names, board)
     intervals: dict[str, list[list[float | None] | None]] = {}
     for (i, metric), (key, cells) in product(enumerate(metrics), chosen.items()):

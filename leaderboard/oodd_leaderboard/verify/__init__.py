@@ -109,11 +109,9 @@ def _guarded(directory: Path, split: str | Path | None) -> EntryVerdict:
 
 
 def _check_info(entry: EntryInfo, name: str, findings: Findings) -> None:
-    """Check ``entry.json`` by itself: its name, and the split it names.
-
-    A split's name that is the benchmark's own stands for one digest only; any other split of that
-    name carries the start of its digest.
-    """
+    """Check ``entry.json`` by itself: its name, and the split it names."""
+    # A split's name that is the benchmark's own stands for one digest only; any other split of that
+    # name carries the start of its digest.
     findings.expect(ENTRY, "id", name, entry.id, "the name of its directory")
     published, split, digest = published_digests(), entry.split, entry.split_digest
     names = [known for known, other in published.items() if other == digest]

@@ -45,10 +45,8 @@ def check_record(where: str, record: Record, findings: Findings) -> None:
 
 
 def _complaints(record: Record) -> Iterator[tuple[str, str]]:
-    """Yield fields of a record and what is wrong with them.
-
-    A record may lack any metric but that which boards rank by: it may be older than the metric.
-    """
+    """Yield fields of a record and what is wrong with them."""
+    # A record may lack any metric but that which boards rank by: it may be older than the metric.
     if record.paired and record.group != (group := ANOMALIES[record.anomaly].group):
         yield "group", f"is {short(record.group)}, expected {group}, that of {record.anomaly}"
     if record.split in SPLITS:
