@@ -74,7 +74,7 @@ def test_what_cannot_join_is_refused_and_changes_nothing():
         watchdog.confirm()
     before = watchdog.calibration, watchdog.rule
     watchdog.update(np.zeros(3))
-    with pytest.raises(UsageError, match="59 .*got 21"):
+    with pytest.raises(UsageError, match=r"59 .*got 21"):
         watchdog.confirm()
     assert (watchdog.calibration, watchdog.rule) == before
     for arguments in ({"confidence": 0.5, "alpha": 0.1}, {"hours": 1, "rate": 50}):
