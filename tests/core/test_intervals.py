@@ -130,12 +130,11 @@ def test_ends_are_those_of_the_accelerated_bootstrap_with_students_quantile(seed
     assert found == pytest.approx(expected, abs=0.04 * (found[1] - found[0]))
 
 
-def test_a_mean_over_environments_has_the_freedom_of_all_their_seeds():
-    values = np.random.default_rng(0).normal(size=4000)
-    one, seven = (bounds(values, 0.0, [20] * e) for e in (1, 7))
-    for found, freedom in ((one, 19), (seven, 133)):
-        half = stats.t.ppf(0.975, freedom) * math.sqrt(20 / 19)
-        assert (found[1] - found[0]) / 2 == pytest.approx(half, rel=0.08)
+def test_the_width_is_students_of_all_seeds_over_the_root_of_n_less_one():
+    drawn = np.array([NormalDist().inv_cdf((i + 0.5) / 20_000) for i in range(20_000)])
+    for sizes, freedom in (([5], 4), ([5, 5, 5], 12)):
+        half = stats.t.ppf(0.975, freedom) * math.sqrt(5 / 4)
+        assert bounds(drawn, 0.0, sizes) == pytest.approx((-half, half), rel=0.01)
 
 
 def test_resamples_that_equal_the_value_are_on_neither_side():

@@ -62,6 +62,7 @@ def test_a_clearly_better_one_ranks_alone():
     rng = np.random.default_rng(1)
     ranking = rank({"a": drawn(rng), "best": drawn(rng, 0.8), "b": drawn(rng)})
     assert ranking.ranks == {"best": 1, "a": 2, "b": 2}
+    assert p_of(ranking, "best", "a").p == 1 / 10_001  # none of 10 000 resamples
     assert [set(group) for group in ranking.groups] == [{"best"}, {"a", "b"}]
     assert [ranking.letters(name) for name in ("best", "a", "b")] == ["", "a", "a"]
 
