@@ -35,17 +35,15 @@ from oodd_logs.readers import NO_OPTIONS, Options
 from oodd_logs.recipe import MISSING_ROWS, Recipe
 
 _REASONS: Final = {
-    "times": "times and counters",
-    "counters": "times and counters",
-    "labels": "labels",
-    "empty": "constant or empty",
-    "constant": "constant or empty",
-    "setpoints": "constant in each recording",
-    "text": "text",
-    "partial": "not in all files",
-    "slow": "in topics with few rows",
+    "times and counters": {"times", "counters"},
+    "labels": {"labels"},
+    "constant or empty": {"empty", "constant"},
+    "constant in each recording": {"setpoints"},
+    "text": {"text"},
+    "not in all files": {"partial"},
+    "in topics with few rows": {"slow"},
 }
-"""Why columns are no sensors, in a remark of the recipe, by their role."""
+"""Roles of columns that are no sensors, by the reason in a remark of the recipe."""
 
 
 def draft_recipe(path: Path, form: str = "", options: Options = NO_OPTIONS) -> Recipe:
@@ -108,14 +106,11 @@ def draft(logs: Inspection, prefix: str = "", name: str = "") -> str:
     ]
     if logs.transposed:
         lines.append(f"transpose = {toml(logs.transposed)}")
-    return "\n".join(map(_remark, [*lines, "", *_draft_files(logs, prefix)])) + "\n"
-
-
-def _remark(line: str) -> str:
-    """Return a line of a recipe; names in a remark have no line break that would end it."""
-    if not line.startswith("#"):
-        return line
-    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
+    lines += ["", *_draft_files(logs, prefix)]
+    for i, line in enumerate(lines):
+        if line.startswith("#"):  # a line break in a name would end the remark
+            lines[i] = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
+    return "\n".join(lines) + "\n"
 
 
 def _draft_rows(logs: Inspection) -> Iterator[str]:
@@ -158,12 +153,10 @@ def _draft_columns(logs: Inspection) -> Iterator[str]:
         yield from (f"  {toml(name)}," for name in sensors)
         yield "]"
         yield '# actions = ["cmd*"]  # what was commanded, if columns say so'
-        for reason in dict.fromkeys(_REASONS.values()):
-            names = [name for name in roles if _REASONS.get(roles[name]) == reason]
-            text = f"left out, {reason}: {listed(names, 40)}"
-            yield from textwrap.wrap(
-                text if names else "", 98, initial_indent="# ", subsequent_indent="#   "
-            )
+        wrapper = textwrap.TextWrapper(98, initial_indent="# ", subsequent_indent="#   ")
+        for reason, of_reason in _REASONS.items():
+            if names := [name for name, role in roles.items() if role in of_reason]:
+                yield from wrapper.wrap(f"left out, {reason}: {listed(names, 40)}")
     facts = {name: logs.columns[name] for name in sensors}
     if flags := [name for name in sensors if facts[name].flag]:
         yield f"# flags among them, which may be labels by other names: {listed(flags)}"
@@ -227,19 +220,19 @@ def _draft_files(logs: Inspection, prefix: str) -> Iterator[str]:
 
 def _globs(files: Sequence[str], names: Sequence[str], prefix: str) -> str:
     """Return names among files as TOML, as globs that match no other file where there are some."""
-    globs, left = [], dict.fromkeys(names)
+    globs, left = [], {*names}
     for name in names:
         folder, file = Path(name).parent, Path(name)
         plain = glob.escape(file.stem)
         stems = "*", re.sub(r"[\W\d_]*\d[\W\d_]*", "*", plain), re.sub(r"\d+$", "*", plain)
         for pattern in (str(folder / f"{stem}{file.suffix}") for stem in stems):
             among = {f for f in files if Path(f).parent == folder and fnmatch.fnmatch(f, pattern)}
-            if name in left and len(among) > 1 and among <= {*left}:
+            if name in left and len(among) > 1 and among <= left:
                 globs.append(pattern)
-                left = {kept: None for kept in left if kept not in among}
+                left -= among
         if name in left:
             globs.append(glob.escape(name))
-            del left[name]
+            left.remove(name)
     globs = [Path(prefix, pattern).as_posix() for pattern in globs]
     if len(globs) < 4:
         return toml(globs)

@@ -3,7 +3,7 @@
 import hashlib
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -154,12 +154,8 @@ class Inspection:
             share = stuck / max(1, facts.cells)
             if share < min(0.01, best.get(topic, 1.0)) and facts.missing < facts.cells / 2:
                 chosen[topic], best[topic] = name, share
-        return {
-            name: "s"
-            if name in self.stamps
-            else time_unit(name, [clock for _, clock in self.clocks(name)])
-            for name in chosen.values()
-        }
+        clocks = {name: [clock for _, clock in self.clocks(name)] for name in chosen.values()}
+        return {n: "s" if n in self.stamps else time_unit(n, c) for n, c in clocks.items()}
 
     @property
     def stamps(self) -> frozenset[str]:
@@ -192,16 +188,13 @@ class Inspection:
         clocks: dict[str, ClockFacts] = {}
         digest = hashlib.sha256()
         head = tail = np.empty(0, np.uint64)
-        for topic_name, topic in recording.topics.items():
+        topics = recording.topics.items()
+        for topic_name, topic in topics:
             below = f"{topic_name}." if topic_name else ""
-            facts = {
-                name: self.columns.setdefault(f"{below}{name}", ColumnFacts())
-                for name in topic.names
-            }
-            columns |= {f"{below}{name}": column for name, column in facts.items()}
-            for name, column in facts.items():
-                before[f"{below}{name}"] = Counter(column.values or {})
-                column.begin()
+            for name in (f"{below}{name}" for name in topic.names):
+                columns[name] = self.columns.setdefault(name, ColumnFacts())
+                before[name] = Counter(columns[name].values or {})
+                columns[name].begin()
             stamps: dict[str, list[tuple[int, NDArray[np.float64]]]] = {}
             dated: dict[str, bool] = {}
             hashed: list[str] = []
@@ -211,14 +204,16 @@ class Inspection:
                     likely = [name for name in block if _may_be_time(topic, name, block[name])]
                     stamps = {name: [] for name in likely}
                     dated = {name: block[name].dtype.kind == "U" for name in likely}
-                    hashed = sorted(name for name in block if _varies(block[name]))
-                    hashed = [name for name in hashed if name not in likely]
+                    numbers = (n for n in block if block[n].dtype.kind == "f" and n not in likely)
+                    hashed = sorted(n for n in numbers if len(np.unique(block[n][:1000])) > FEW)
+                rows = np.zeros(len(next(iter(block.values()))) if hashed else 0, np.uint64)
                 for name, cells in block.items():
                     if start != following:
-                        facts[name].leap()
-                    facts[name].add(cells)
+                        columns[f"{below}{name}"].leap()
+                    columns[f"{below}{name}"].add(cells)
                     digest.update(cells.tobytes())
-                rows = _row_hashes([block[name] for name in hashed])
+                for name in hashed:
+                    rows = rows * _PRIME ^ np.ascontiguousarray(block[name]).view(np.uint64)
                 head = np.append(head, rows[: _ENDS - len(head)])
                 tail = np.append(tail, rows)[-_ENDS:]
                 following = start + len(next(iter(block.values())))
@@ -231,7 +226,6 @@ class Inspection:
             for name, blocks in stamps.items():
                 if clock := ClockFacts.of(blocks, dated=dated[name]):
                     clocks[f"{below}{name}"] = clock
-        topics = recording.topics.items()
         self.recordings.append(
             RecordingFacts(
                 recording.name,
@@ -294,10 +288,13 @@ def inspect_logs(
         progress(names[file])
         try:
             for recording in reader.read(file, options):
-                columns = {n for topic in recording.topics.values() for n in topic.names}
-                if any(expected <= columns for expected in _INTERVALS):
+                columns = [n for topic in recording.topics.values() for n in topic.names]
+                # Those of a matrix, or of a text without a header, are numbered.
+                stems = {re.sub(r"\d+(\[.*\])?$", "", name) for name in columns}
+                is_matrix = len(recording.topics) == len(stems) == 1 < len(columns)
+                if any(expected <= {*columns} for expected in _INTERVALS):
                     result.intervals = names[file]
-                elif _unnamed(recording) and "transpose" in reader.options:
+                elif is_matrix and "transpose" in reader.options:
                     later.append((file, recording))
                 else:
                     result.add(recording, names[file])
@@ -314,10 +311,15 @@ def inspect_logs(
             result.add(recording, names[file])
     if result.problems and not result.recordings:
         raise TrajectoryError(result.problems[0])
-    places = {name: i for i, name in enumerate(names.values())}
-    result.recordings.sort(key=lambda recording: places[recording.file])
+    order = {name: i for i, name in enumerate(names.values())}
+    result.recordings.sort(key=lambda recording: order[recording.file])
     result.equal = _equal(result.recordings)
-    result.shared = _shared(result.recordings, {file for same in result.equal for file in same})
+    equal = {file for same in result.equal for file in same}
+    by_digest: dict[str, set[str]] = defaultdict(set)
+    for facts in result.recordings:
+        by_digest[facts.digest].add(facts.file)
+    shared = Counter(r.file for r in result.recordings if len(by_digest[r.digest]) > 1)
+    result.shared = {file: n for file, n in shared.items() if file not in equal}
     result.continued = _continued(result.recordings)
     return result
 
@@ -335,7 +337,10 @@ def recognised(path: Path, form: str) -> tuple[Reader, list[Path], Counter[str]]
             for candidates in ([path], sorted(filter(Path.is_dir, path.iterdir()))):
                 if sets := [directory for directory in candidates if reader.fits(directory)]:
                     return reader, sets, Counter()
-    files = [path] if path.is_file() else sorted(_files(path), key=lambda f: in_order(str(f)))
+    files = [path]
+    if not path.is_file():
+        visible = (f for f in path.rglob("*") if "/." not in f"/{f.relative_to(path).as_posix()}")
+        files = sorted(filter(Path.is_file, visible), key=lambda file: in_order(str(file)))
     by_reader: dict[str, list[Path]] = defaultdict(list)
     for file in files:
         best = max(known.values(), key=lambda reader: reader.fits(file))
@@ -350,24 +355,6 @@ def recognised(path: Path, form: str) -> tuple[Reader, list[Path], Counter[str]]
     name = max(by_reader, key=lambda reader: len(by_reader[reader]))
     left_out = {*files} - {*by_reader[name]}
     return known[name], by_reader[name], Counter(file.suffix for file in left_out)
-
-
-def _files(folder: Path) -> Iterator[Path]:
-    for file in folder.rglob("*"):
-        if file.is_file() and not any(p.startswith(".") for p in file.relative_to(folder).parts):
-            yield file
-
-
-def _varies(cells: Column) -> bool:
-    """Tell whether a column is of numbers that are not few."""
-    return cells.dtype.kind == "f" and len(np.unique(cells[:1000])) > FEW
-
-
-def _row_hashes(columns: Sequence[Column]) -> NDArray[np.uint64]:
-    hashes = np.zeros(len(columns[0]) if columns else 0, np.uint64)
-    for cells in columns:
-        hashes = hashes * _PRIME ^ np.ascontiguousarray(cells).view(np.uint64)
-    return hashes
 
 
 def _continued(recordings: Sequence[RecordingFacts]) -> list[tuple[str, str, int]]:
@@ -403,48 +390,27 @@ def _equal(recordings: Sequence[RecordingFacts]) -> list[list[str]]:
     return [same for same in groups.values() if len(same) > 1]
 
 
-def _shared(recordings: Sequence[RecordingFacts], equal: Collection[str]) -> dict[str, int]:
-    """Return how many recordings of each file, but for equal ones, stand in another, too."""
-    files: dict[str, set[str]] = defaultdict(set)
-    for recording in recordings:
-        files[recording.digest].add(recording.file)
-    counts = Counter(r.file for r in recordings if len(files[r.digest]) > 1)
-    return {file: n for file, n in counts.items() if file not in equal}
-
-
-def _unnamed(recording: Recording) -> bool:
-    """Tell whether columns are numbered, as those of a matrix or of a text without a header."""
-    if len(recording.topics) != 1:
-        return False
-    (topic,) = recording.topics.values()
-    stems = {re.sub(r"\d+(\[.*\])?$", "", name) for name in topic.names}
-    return len(stems) == 1 and len(topic.names) > 1
-
-
 def _exchanged(matrices: Sequence[tuple[Path, Recording]]) -> set[Path]:
     """Return the files whose rows are columns."""
     # The first row counts like a clock, or there are as many rows as neighbours have columns, or
     # there is no neighbour to compare with and there are three times as many columns as rows.
     topics = [(file, next(iter(recording.topics.values()))) for file, recording in matrices]
     tall = Counter(len(t.names) for _, t in topics if t.rows > len(t.names))
-    exchanged = set()
-    for file, topic in topics:
-        wide = len(topic.names) > topic.rows
-        if _first_row_counts(topic) or (
-            wide and (topic.rows in tall if tall else len(topic.names) >= 3 * topic.rows)
-        ):
-            exchanged.add(file)
-    return exchanged
+    return {
+        file
+        for file, topic in topics
+        if _first_row_counts(topic)
+        or (len(topic.names) > topic.rows and topic.rows in tall)
+        or (not tall and len(topic.names) >= max(3 * topic.rows, topic.rows + 1))
+    }
 
 
 def _first_row_counts(topic: Topic) -> bool:
     """Tell whether a first row of at least `_FIRST` numbers rises in equal steps."""
     if len(topic.names) < _FIRST or not topic.rows:
         return False
-    row = topic.read(topic.names, 0, 1).values()
-    if any(cells.dtype.kind == "U" for cells in row):
-        return False
-    steps = np.diff([float(cells[0]) for cells in row])
+    row = np.concatenate([*topic.read(topic.names, 0, 1).values()])
+    steps = np.diff(row) if row.dtype.kind == "f" else np.zeros(1)
     return bool(steps[0] > 0 and np.allclose(steps, steps[0], rtol=1e-3))
 
 

@@ -129,26 +129,24 @@ def sort_files(logs: Inspection) -> Sorting:
     if logs.labels:
         label = logs.labels[0]
         values = nominal_values(logs, label)
-        rows = [r.file for r in logs.recordings if anomalous_rows(r, label, values)]
-        anomalous = [file for file in files if file in {*rows}]
+        rows = {r.file for r in logs.recordings if anomalous_rows(r, label, values)}
+        anomalous = [file for file in files if file in rows]
         if len(anomalous) < len(files):
             return _by_kind(files, anomalous, f"files told apart by {label}")
         return Sorting(tuple(files), every, f"windows told apart by {label}")
     if logs.intervals:
         return Sorting(tuple(files), every, "windows told apart by intervals")
-    anomalous = [file for file in files if not NOMINAL_WORDS.search(_words(file))]
+    words = {file: str(Path(file).with_suffix("")).replace("_", " ") for file in files}
+    anomalous = [file for file in files if not NOMINAL_WORDS.search(words[file])]
     if len(anomalous) < len(files) and not {"outcome", "kinds"} & {*keys_of_fields(logs)}:
         return _by_kind(files, anomalous, "files told apart by their names")
     return Sorting(tuple(files), {}, "")
 
 
-def _words(file: str) -> str:
-    return str(Path(file).with_suffix("")).replace("_", " ")
-
-
 def _by_kind(files: Sequence[str], anomalous: Sequence[str], reason: str) -> Sorting:
     """Name anomalies by the folders of their files, or by what their names do not share."""
-    parts = {file: re.split(r"[\s_.,/\-]+", _words(file).lower()) for file in files}
+    texts = {file: str(Path(file).with_suffix("")).lower() for file in files}
+    parts = {file: re.split(r"[\s_.,/\-]+", text) for file, text in texts.items()}
     shared = set.intersection(*map(set, parts.values()))
     kinds: dict[str, list[str]] = defaultdict(list)
     for file in anomalous:
@@ -168,9 +166,15 @@ def name_of(text: str, otherwise: str, reserved: Mapping[str, Any]) -> str:
 
 def window_of(logs: Inspection) -> int:
     """Return rows that cut long nominal recordings into enough; 0 where they are short."""
-    nominal = nominal_recordings(logs)
-    rows = int(sum(_resampled(logs, recording) for recording in nominal))
-    window = max(_SHORTEST, rows // _WINDOWS)
+    nominal, times, rows = nominal_recordings(logs), logs.times, 0.0
+    for recording in nominal:
+        seconds = [
+            recording.rows[logs.topic_of(name)] * clock.steps.usual * SCALES[times[name]]
+            for name, clock in recording.clocks.items()
+            if name in times
+        ]
+        rows += max(seconds) * float(rate_of(logs)) if seconds else recording.length
+    window = max(_SHORTEST, int(rows) // _WINDOWS)
     if len(nominal) >= ENOUGH or rows < 20 * window:
         return 0
     digits = len(str(window)) - 2
@@ -192,16 +196,6 @@ def nominal_recordings(logs: Inspection) -> list[RecordingFacts]:
     """Return the recordings of files that seem to be nominal, at least in part."""
     files = sort_files(logs).nominal
     return [recording for recording in logs.recordings if recording.file in files]
-
-
-def _resampled(logs: Inspection, recording: RecordingFacts) -> float:
-    """Return the rows that a recording has at the rate of the recipe."""
-    seconds = [
-        recording.rows[logs.topic_of(name)] * recording.clocks[name].steps.usual * SCALES[unit]
-        for name, unit in logs.times.items()
-        if name in recording.clocks
-    ]
-    return max(seconds) * float(rate_of(logs)) if seconds else recording.length
 
 
 def step_of(logs: Inspection, name: str) -> float:

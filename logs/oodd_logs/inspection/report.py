@@ -166,15 +166,9 @@ def _of_times(logs: Inspection) -> Iterator[Advice]:
     gap = number(gap_of(logs))
     if gaps:
         recording, clock = max(clocks, key=lambda pair: pair[1].steps.longest)
-        yield _say(
-            "gaps",
-            gaps=counted(gaps, "gap(s)"),
-            steps=GAP_STEPS,
-            longest=number(clock.steps.longest * SCALES[unit]),
-            row=clock.steps.after + 1,
-            file=recording.file,
-            gap=gap,
-        )
+        longest, row = number(clock.steps.longest * SCALES[unit]), clock.steps.after + 1
+        values = {"longest": longest, "row": row, "file": recording.file, "gap": gap}
+        yield _say("gaps", gaps=counted(gaps, "gap(s)"), steps=GAP_STEPS, **values)
     if falls:
         yield _say("falls", rows=counted(falls, "row(s)"), gap=gap)
 
@@ -246,17 +240,16 @@ def looks_like(logs: Inspection) -> dict[str, str]:
         facts = logs.columns[name]
         values = [] if facts.values is None else sorted(facts.values, key=str)
         texts = ", ".join(v if isinstance(v, str) else number(v) for v in values)
-        match roles[name]:
-            case "times":
-                return f"time ({_UNITS[times[name]]})"
-            case "labels":
-                return f"label? {texts}"
-            case "text":
-                return f"text: {texts}" if values else "text, many values"
-            case "counters":
-                return "counter: never falls"
-            case "empty" | "constant":
-                return roles[name]
+        by_role = {
+            "times": f"time ({_UNITS.get(times.get(name, ''))})",
+            "labels": f"label? {texts}",
+            "text": f"text: {texts}" if values else "text, many values",
+            "counters": "counter: never falls",
+            "empty": "empty",
+            "constant": "constant",
+        }
+        if roles[name] in by_role:
+            return by_role[roles[name]]
         if facts.flag:
             return f"flag: {texts}"
         if facts.wraps:
@@ -297,9 +290,8 @@ def describe_logs(logs: Inspection, width: int = 80) -> str:
     parts.append(_column_table(logs, width))
     if advice := advise(logs):
         indent = max(len(topic) for topic, _ in advice) + 2
-        wrapper = textwrap.TextWrapper(
-            min(width, 110), subsequent_indent=" " * indent, break_on_hyphens=False
-        )
+        wrapper = textwrap.TextWrapper(min(width, 110), break_on_hyphens=False)
+        wrapper.subsequent_indent = " " * indent
         parts.append("\n".join(wrapper.fill(f"{a.topic:{indent}}{a.text}") for a in advice))
     return "\n\n".join(parts)
 
@@ -337,13 +329,9 @@ def _column_table(logs: Inspection, width: int) -> str:
     before = sum(max([len(header[i]), *(len(row[i]) for row in rows)]) + 2 for i in kept if i < 5)
     for row in rows:
         row[-1] = "\n".join(textwrap.wrap(row[-1], max(16, width - before)))
-    table = tabulate(
-        [[row[i] for i in kept] for row in rows],
-        [header[i] for i in kept],
-        "simple",
-        colalign=["right" if 1 < i < 5 else "left" for i in kept] if rows else None,
-        disable_numparse=True,
-    )
+    cells, titles = [[row[i] for i in kept] for row in rows], [header[i] for i in kept]
+    align = ["right" if 1 < i < 5 else "left" for i in kept] if rows else None
+    table = tabulate(cells, titles, "simple", colalign=align, disable_numparse=True)
     text = "\n".join(line.rstrip() for line in table.splitlines())
     left_out = len(looks) - len(names)
     more = f"\n\nand {left_out} more columns, most of them plain numbers or constants"
