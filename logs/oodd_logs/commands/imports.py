@@ -28,17 +28,8 @@ def _quantities(text: str) -> tuple[Quantity, ...]:
 _QUANTITIES: Final = Converted(_quantities, "NAME[UNIT],...")
 _GROUP: Final = Converted(assignment, "ANOMALY=sensor|dynamics")
 
-_SHORT: Final = [
-    "env",
-    "format",
-    "train",
-    "calibration",
-    "test",
-    "sensors",
-    "actions",
-    "discrete",
-    "group",
-]
+_REQUIRED: Final = ("env", "format", "train", "calibration")
+_SHORT: Final = (*_REQUIRED, "test", "sensors", "actions", "discrete", "group")
 """Options that stand for a recipe."""
 
 _DETECTORS: Final = "mewma,mahalanobis,range,clock"  # fitted in seconds, without an extra
@@ -95,12 +86,11 @@ def import_logs(options: Options) -> int:
         environment = recipe.environment
         split = import_recipe(recipe, options.root or path.parent, **say)
     else:
-        required = ("env", "format", "train", "calibration")
-        if lacking := [name for name in required if name not in chosen]:
+        if lacking := [name for name in _REQUIRED if name not in chosen]:
             raise UsageError(
                 f"{options.name!r} is no recipe (FILE.toml, or {', '.join(shipped_recipes())}), "
                 f"and --{lacking[0]} is missing: expected "
-                f"{', '.join(f'--{name}' for name in required)} without one"
+                f"{', '.join(f'--{name}' for name in _REQUIRED)} without one"
             )
         if options.root:
             raise UsageError("--root is the folder of a recipe's files, expected FILE.toml with it")

@@ -20,7 +20,7 @@ from oodd_eval.prose import print_prose
 from oodd_logs.commands.reader_plugins import register_formats
 from oodd_logs.recipe import Recipe
 from oodd_logs.scanning.logs import read_logs
-from oodd_logs.scanning.scan import SCANNER, Scan, ScannedEpisode, scan_episodes
+from oodd_logs.scanning.scan import SCANNER, Scan, scan_episodes
 from oodd_logs.scanning.scan_page import NUMBERS, cells, figure, page, summary, titles
 from oodd_logs.scanning.viewers import write_mcap, write_rerun
 
@@ -77,14 +77,10 @@ def scan(options: Options) -> int:
         refuse(options, ["format", "read"], "is said by the recipe: write it there")
     register_formats(options)
     recipe = Recipe.load(options.recipe) if options.recipe else None
-    logs = read_logs(
-        options.logs,
-        recipe,
-        options.format or "",
-        dict(options.read),
-        options.window,
-        options.recipe.parent if options.recipe else None,
-    )
+    home = options.recipe.parent if options.recipe else None
+    form, read = options.format or "", dict(options.read)
+    logs = read_logs(options.logs, recipe, form, read, options.window, home)
+    parameters = parameters_by_detector([options.detector], dict(options.param))
     result = scan_episodes(
         logs.episodes,
         sensors=logs.sensors,
@@ -92,9 +88,7 @@ def scan(options: Options) -> int:
         watchdog=Watchdog.load(options.watchdog) if options.watchdog else None,
         fdr=options.fdr,
         baseline=logs.baseline,
-        parameters=parameters_by_detector([options.detector], dict(options.param))[
-            options.detector
-        ],
+        parameters=parameters[options.detector],
         jobs=options.jobs,
     )
     _print(result, logs.notes, options)
@@ -112,7 +106,13 @@ def scan(options: Options) -> int:
 def _print(result: Scan, notes: Sequence[str], options: Options) -> None:
     console = make_console()
     if options.verbosity >= 0:
-        listed = _listed(result, everything=options.verbosity > 0)
+        # The oddest first: of many, odd ones and the next to these.
+        listed = sorted(
+            result.episodes,
+            key=lambda one: (not one.odd, math.inf if math.isnan(one.p) else one.p, -one.largest),
+        )
+        if options.verbosity == 0 and len(listed) > _MANY:
+            listed = listed[: len(result.odd) + _NEXT]
         heads = titles(listed)
         # Names may have line breaks.
         lines = [
@@ -121,28 +121,18 @@ def _print(result: Scan, notes: Sequence[str], options: Options) -> None:
         ]
         kept = [i for i in range(len(heads)) if i < _ALWAYS or any(line[i] for line in lines)]
         align = ["left", *("right" if heads[i] in NUMBERS else "left" for i in kept)]
-        table = tabulate(
-            [
-                ["odd" * one.odd, *(line[i] for i in kept)]
-                for one, line in zip(listed, lines, strict=True)
-            ],
-            ["", *(heads[i] for i in kept)],
-            "simple",
-            disable_numparse=True,
-            colalign=align,
-        )
+        marks = ["odd" * one.odd for one in listed]
+        rows = [[mark, *(line[i] for i in kept)] for mark, line in zip(marks, lines, strict=True)]
+        head = ["", *(heads[i] for i in kept)]
+        table = tabulate(rows, head, "simple", disable_numparse=True, colalign=align)
         colours = ["", "", *("bold red" * one.odd for one in listed)]
         for line, colour in zip(table.splitlines(), colours, strict=True):
             console.print(Text(line.rstrip(), colour))
         console.print("")
         left = len(result.episodes) - len(listed)
-        for note in [
-            _COLUMNS,
-            *([f"Not listed: {counted(left, 'less odd episode(s)')} (-v lists all)."] * (left > 0)),
-            *notes,
-            *result.notes,
-            *_on_labels(result, fitted=not options.watchdog),
-        ]:
+        unlisted = f"Not listed: {counted(left, 'less odd episode(s)')} (-v lists all)."
+        said = [*notes, *result.notes, *_on_labels(result, fitted=not options.watchdog)]
+        for note in (_COLUMNS, *([unlisted] * (left > 0)), *said):
             print_prose(note, console)
     console.print(Text(summary(result)))
     if result.odd and not options.html and options.verbosity >= 0:
@@ -177,13 +167,3 @@ def _on_labels(result: Scan, *, fitted: bool) -> Iterator[str]:
         else "A detector that is fitted on nominal episodes alone finds smaller faults: use "
         "`oodd-eval data import` and `run`, or a watchdog (--watchdog FILE)."
     )
-
-
-def _listed(result: Scan, *, everything: bool) -> list[ScannedEpisode]:
-    """Return the episodes of the table, the oddest first: of many, odd ones and the next to it."""
-    oddest = sorted(
-        result.episodes,
-        key=lambda one: (not one.odd, math.inf if math.isnan(one.p) else one.p, -one.largest),
-    )
-    most = len(oddest) if everything or len(oddest) <= _MANY else len(result.odd) + _NEXT
-    return oddest[:most]

@@ -78,8 +78,12 @@ def read_logs(
             window = 0 if len(logs.recordings) >= ENOUGH else window_of(logs)
     if window is not None:
         recipe = replace(recipe, window=window, nominal=replace(recipe.nominal, window=None))
-    if home is not None and files[0].is_relative_to(home) and not _lists(recipe, root):
-        root = home
+    if home is not None and files[0].is_relative_to(home):
+        nominal = recipe.nominal
+        listed = [nominal.files, nominal.train, nominal.calibration, nominal.test, nominal.twins]
+        listed += [table.files for table in recipe.anomalous.values()]
+        if not any(names_matching(pattern, root) for pattern in itertools.chain(*listed)):
+            root = home
     with read_every_episode(recipe, root, files) as source:
         return RecordedLogs(
             list(source.episodes(EVERY)),
@@ -87,13 +91,3 @@ def read_logs(
             recipe.baseline,
             list(source.notes),
         )
-
-
-def _lists(recipe: Recipe, root: Path) -> bool:
-    """Tell whether any file of a recipe is there, relative to a folder."""
-    nominal = recipe.nominal
-    tables = (table.files for table in recipe.anomalous.values())
-    patterns = itertools.chain(
-        nominal.files, nominal.train, nominal.calibration, nominal.test, nominal.twins, *tables
-    )
-    return any(names_matching(pattern, root) for pattern in patterns)

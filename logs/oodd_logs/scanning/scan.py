@@ -4,12 +4,13 @@ Each episode is judged by a detector that was fitted on others, and its largest 
 Faults of the stream, such as gaps and frozen sensors, are looked for by themselves.
 """
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from multiprocessing import get_context
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -93,10 +94,8 @@ class ScannedEpisode:
     @property
     def first(self) -> int | None:
         """The first odd row, of the statistic or of a fault; None where there is none."""
-        rows = [f.row for f in self.faults]
-        if self.since is not None:
-            rows.append(self.since)
-        return min(rows, default=None)
+        rows = [self.since, *(fault.row for fault in self.faults)]
+        return min((row for row in rows if row is not None), default=None)
 
     @property
     def alarms(self) -> NDArray[np.bool_]:
@@ -148,8 +147,7 @@ class ScannedEpisode:
             "faults": [asdict(fault) for fault in self.faults],
             "label": self.label,
         }
-        plain: dict[str, Any] = without_nan(values)
-        return plain
+        return cast("dict[str, Any]", without_nan(values))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -302,25 +300,22 @@ def scan_episodes(
     fit = _Fit(detector, seed, horizon, {**defaults, **(parameters or {})}, baseline)
     handle = fit.handle()
     trajectories = [one.trajectory for one in cleaned]
-    folds = [list(range(k, len(usable), FITS)) for k in range(min(FITS, len(usable)))]
-    work = [
-        ([x for i, x in enumerate(trajectories) if i not in fold], [trajectories[i] for i in fold])
-        for fold in folds
-    ]
-    outcomes = dict(zip((i for fold in folds for i in fold), _all(fit, work, jobs), strict=True))
+    folds = [range(k, len(usable), FITS) for k in range(min(FITS, len(usable)))]
+    others = [[x for i, x in enumerate(trajectories) if i not in fold] for fold in folds]
+    left_out = [[trajectories[i] for i in fold] for fold in folds]
+    if jobs == 1:
+        answers = [*map(fit.judge, others, left_out)]
+    else:
+        with ProcessPoolExecutor(min(jobs, len(folds)), get_context("spawn")) as pool:
+            answers = [*pool.map(fit.judge, others, left_out)]
+    numbers = itertools.chain(*folds)
+    outcomes = dict(zip(numbers, itertools.chain(*answers), strict=True))
     scores = [outcomes[i][0] for i in range(len(usable))]
-    judged = [
-        _Judged(
-            one,
-            scores[i],
-            _statistic(handle.alarm, scores, _peers(usable, i), i),
-            outcomes[i][1],
-            faults[i],
-            cleaned[i].trajectory,
-            baseline,
-        )
-        for i, one in enumerate(usable)
-    ]
+    judged = []
+    for i, one in enumerate(usable):
+        statistic = _statistic(handle.alarm, scores, _peers(usable, i), i)
+        said = scores[i], statistic, outcomes[i][1], faults[i]
+        judged.append(_Judged(one, *said, trajectories[i], baseline))
     how = "each episode is judged by a fit that has not seen it."
     notes.insert(0, f"{counted(len(usable), 'episode(s)')}, {counted(len(folds), 'fit(s)')}: {how}")
     name = handle.state["name"] or type(handle.detector).__name__
@@ -432,9 +427,8 @@ class _Fit:
     def judge(self, others: Sequence[Trajectory], episodes: Sequence[Trajectory]) -> list[Outcome]:
         """Fit on some episodes and judge others."""
         handle = self.handle()
-        detector, base = handle.detector, None
-        if self.baseline:
-            base = Baseline.fit(others, self.baseline)
+        detector = handle.detector
+        base = Baseline.fit(others, self.baseline) if self.baseline else None
         hidden = 0 if handle.adapts else self.baseline
         try:
             detector.fit([handle.visible(x, base) for x in others])
@@ -444,14 +438,10 @@ class _Fit:
                 if isinstance(detector, ExplainingDetector):
                     visible = handle.visible(x, base)
                     shares, onsets = checked_explanation(detector.explain(visible), visible)
-                    explanation = Explanation(
-                        np.pad(shares, ((hidden, 0), (0, 0)), constant_values=np.nan),
-                        np.pad(
-                            np.where(onsets < 0, -1, onsets + hidden),
-                            (hidden, 0),
-                            constant_values=-1,
-                        ),
-                    )
+                    shares = np.pad(shares, ((hidden, 0), (0, 0)), constant_values=np.nan)
+                    onsets = np.where(onsets < 0, -1, onsets + hidden)
+                    onsets = np.pad(onsets, (hidden, 0), constant_values=-1)
+                    explanation = Explanation(shares, onsets)
                 outcomes.append((scores, explanation))
         except OoddError:
             raise
@@ -460,15 +450,6 @@ class _Fit:
             what = f"detector {name} raised {type(error).__name__}: {error}"
             raise ContractError(f"{what} (fitted on {len(others)} episodes)") from error
         return outcomes
-
-
-def _all(
-    fit: _Fit, work: Sequence[tuple[list[Trajectory], list[Trajectory]]], jobs: int
-) -> list[Outcome]:
-    if jobs == 1:
-        return [one for task in work for one in fit.judge(*task)]
-    with ProcessPoolExecutor(min(jobs, len(work)), get_context("spawn")) as pool:
-        return [one for part in pool.map(fit.judge, *zip(*work, strict=True)) for one in part]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -493,6 +474,13 @@ class _Judged:
             rows -= rows[: self.baseline].mean(axis=0)
         return np.stack([rows, np.diff(rows, axis=0, prepend=rows[:1])])
 
+    @property
+    def sums(self) -> Floats:
+        """Number, sum and sum of squares of readings and of steps, (3, 2, D)."""
+        evidence = self.evidence
+        sums: Floats = np.stack([np.ones_like(evidence), evidence, evidence**2]).sum(axis=2)
+        return sums
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Terms:
@@ -507,12 +495,6 @@ class _Terms:
     limit: float = math.nan
     reference: Floats | None = None
     exact: bool = False
-
-
-_EXACT: Final = (
-    "The {} calibration episodes are enough for p-values by rank, which keep the false discovery "
-    "rate whatever the distribution."
-)
 
 
 def _verdict(judged: Sequence[_Judged], names: Sequence[str], terms: _Terms) -> Scan:
@@ -530,15 +512,25 @@ def _verdict(judged: Sequence[_Judged], names: Sequence[str], terms: _Terms) -> 
         if tail is not None and largest[i] > tail.start and not terms.exact:
             p[i] = tail.p(largest[i])
     fewest = min(map(len, references)) + 1
-    notes, known = terms.notes, fewest >= LEAST
+    notes, known = [*terms.notes], fewest >= LEAST
     if not known:
         p[:] = math.nan
-        notes = [*notes, _too_few(fewest, terms)]
+        deciding = "faults of the stream decide"
+        if terms.limit > 0:
+            deciding = "the watchdog's threshold decides"
+        notes.append(
+            f"{fewest} episodes are too few to judge one by the others, which takes {LEAST} and "
+            f"works well from {ENOUGH} on: here {deciding} alone. Record more, or cut long ones "
+            "(window)."
+        )
     elif terms.exact:
-        notes = [*notes, _EXACT.format(fewest - 1)]
+        notes.append(
+            f"The {fewest - 1} calibration episodes are enough for p-values by rank, which keep "
+            "the false discovery rate whatever the distribution."
+        )
     q = q_values(p) if known else p
     critical = critical_p(p, terms.fdr) if known else math.nan
-    sums = np.stack([_sums(one.evidence) for one in judged])
+    sums = np.stack([one.sums for one in judged])
     scanned = []
     for i, one in enumerate(judged):
         tail, threshold = tails[i], terms.limit
@@ -598,17 +590,6 @@ def _statistic(kind: AlarmKind, scores: Sequence[Floats], peers: Sequence[int], 
     return GuaranteedAlarm(standardization, math.inf).statistic(scores[i])
 
 
-def _too_few(count: int, terms: _Terms) -> str:
-    deciding = "faults of the stream decide"
-    if terms.limit > 0:
-        deciding = "the watchdog's threshold decides"
-    return (
-        f"{count} episodes are too few to judge one by the others, which takes {LEAST} and works "
-        f"well from {ENOUGH} on: here {deciding} alone. Record more, or cut long ones "
-        "(window)."
-    )
-
-
 def _blame(
     judged: _Judged, usual: float, interval: tuple[int, int], others: Floats
 ) -> tuple[int, Floats]:
@@ -628,9 +609,3 @@ def _blame(
     deviations = (np.abs(judged.evidence - mean) / np.maximum(std, least)).max(axis=0)
     of_excursion = (deviations[since:stop] ** 2).mean(axis=0)
     return since, of_excursion / (of_excursion.sum() or 1.0)
-
-
-def _sums(evidence: Floats) -> Floats:
-    """Return number, sum and sum of squares of readings and of steps, (3, 2, D)."""
-    sums: Floats = np.stack([np.ones_like(evidence), evidence, evidence**2]).sum(axis=2)
-    return sums

@@ -98,21 +98,19 @@ def write_mcap(scan: Scan, path: Path) -> None:
     with replacing(path) as temporary, temporary.open("wb") as file:
         writer = Writer(file)
         writer.start(library="oodd-eval")
-        schemas = {
-            kind: writer.register_schema(
-                f"oodd.{kind}",
-                "jsonschema",
-                json.dumps({"type": "object", "properties": properties}).encode(),
-            )
-            for kind, properties in (("sensors", readings), ("oodd", _VERDICT))
-        }
+        schemas = {}
+        for kind, properties in (("sensors", readings), ("oodd", _VERDICT)):
+            schema = json.dumps({"type": "object", "properties": properties}).encode()
+            schemas[kind] = writer.register_schema(f"oodd.{kind}", "jsonschema", schema)
         for name, one in _named(scan):
             channels = {
                 kind: writer.register_channel(f"/{name}/{kind}", "json", schema)
                 for kind, schema in schemas.items()
             }
-            for t, message in enumerate(_messages(one, scan)):
-                stamp = _nanoseconds(one, t)
+            for t, alarm in enumerate(one.alarms.tolist()):
+                time, message = one.episode.time, _message(one, scan, t, alarm=alarm)
+                seconds = float(t if time is None else time[t])
+                stamp = max(0, as_nanoseconds(seconds)) if math.isfinite(seconds) else 0
                 for kind, channel in channels.items():
                     content = json.dumps(without_nan(message[kind])).encode()
                     writer.add_message(channel, stamp, content, stamp, t)
@@ -140,29 +138,14 @@ def _series(one: ScannedEpisode, scan: Scan) -> dict[tuple[str, ...], Any]:
     }
 
 
-def _messages(one: ScannedEpisode, scan: Scan) -> list[dict[str, Any]]:
-    return [
-        {
-            "sensors": dict(zip(scan.sensors, row, strict=True)),
-            "oodd": {
-                "score": score,
-                "statistic": statistic,
-                "threshold": one.threshold,
-                "alarm": alarm,
-                "suspects": one.suspects if alarm else [],
-            },
-        }
-        for row, score, statistic, alarm in zip(
-            one.episode.observations.tolist(),
-            one.scores.tolist(),
-            one.statistic.tolist(),
-            one.alarms.tolist(),
-            strict=True,
-        )
-    ]
-
-
-def _nanoseconds(one: ScannedEpisode, t: int) -> int:
-    time = one.episode.time
-    seconds = float(t) if time is None else float(time[t])
-    return max(0, as_nanoseconds(seconds)) if math.isfinite(seconds) else 0
+def _message(one: ScannedEpisode, scan: Scan, t: int, *, alarm: bool) -> dict[str, Any]:
+    """Return the content of both topics at a row."""
+    verdict = {
+        "score": float(one.scores[t]),
+        "statistic": float(one.statistic[t]),
+        "threshold": one.threshold,
+        "alarm": alarm,
+        "suspects": one.suspects if alarm else [],
+    }
+    readings = one.episode.observations[t].tolist()
+    return {"sensors": dict(zip(scan.sensors, readings, strict=True)), "oodd": verdict}
