@@ -46,11 +46,8 @@ def flat(value: Any, name: str = "", depth: int = 0) -> Iterator[tuple[str, Any]
     elif hasattr(value, "__slots__") and isinstance(value, SimpleNamespace):
         value = {key: getattr(value, key) for key in value.__slots__}
     elif dataclasses.is_dataclass(value):
-        value = {
-            f.name: getattr(value, f.name)
-            for f in dataclasses.fields(value)
-            if not f.name.startswith("__")
-        }
+        names = (f.name for f in dataclasses.fields(value) if not f.name.startswith("__"))
+        value = {key: getattr(value, key) for key in names}
     if isinstance(value, Mapping) and {*value} in _STAMPS:
         whole, part = value.values()
         value = whole + part / 1e9
@@ -83,9 +80,7 @@ class Gathered:
     def add(self, cells: Mapping[str, Any]) -> None:
         """Add a row; names that it lacks are missing there."""
         for name, value in cells.items():
-            column = self._numbers.get(name)
-            if column is None:
-                column = self._numbers[name] = array.array("d")
+            column = self._numbers.setdefault(name, array.array("d"))
             column.extend([math.nan] * (self.rows - len(column)))
             if isinstance(value, str):
                 self._texts.setdefault(name, {})[self.rows] = value
@@ -101,10 +96,8 @@ class Gathered:
 
     def topic(self, time: str = "") -> Topic:
         """Return the rows as a topic."""
-        columns = {}
-        for label, name in zip(column_names(self._numbers), self._numbers, strict=True):
-            columns[label] = self._column(name)
-        return Topic.of(columns, time)
+        columns = map(self._column, self._numbers)
+        return Topic.of(dict(zip(column_names(self._numbers), columns, strict=True)), time)
 
     def _column(self, name: str) -> Column:
         values = np.frombuffer(self._numbers[name], np.float64)

@@ -101,11 +101,8 @@ def _arrays(
 
 def _fields(file: StoredFile, group: str, source: str) -> dict[str, Any]:
     named = file.attributes(group, ("onset", "seed", "parameters"))
-    fields = {
-        key: value
-        for key, value in file.single_values(group).items()
-        if not isinstance(value, str) or len(value) <= _LONGEST
-    }
+    single = file.single_values(group).items()
+    fields = {k: v for k, v in single if not isinstance(v, str) or len(v) <= _LONGEST}
     for name in ("onset", "seed"):
         if name in named:
             fields[name] = whole_number(source, name, named[name])

@@ -97,11 +97,9 @@ def _episode(
     """Return an episode; `span` is its rows in the file."""
     columns = _columns(rows.names, facts, source)
     first, count = span[0], span[1] - span[0]
-    fields: dict[str, Any] = {}
-    head = rows.read([n for n in rows.names if n in _COUNTERS], first, first + bool(count))
-    for counter in ("episode_index", "task_index"):
-        if counter in head and count:
-            fields[counter] = int(head[counter][0])
+    counters = [n for n in ("episode_index", "task_index") if n in rows.names and count]
+    head = rows.read(counters, first, first + 1) if counters else {}
+    fields: dict[str, Any] = {counter: int(head[counter][0]) for counter in counters}
     task = tasks.get(fields.get("task_index", -1), {}).get("task") or more.get("tasks")
     if isinstance(task, list | tuple):
         task = task[0] if len(task) == 1 else None
@@ -110,22 +108,21 @@ def _episode(
     success = next((c for c in ("next.success", "success", "is_success") if c in rows.names), None)
     if success and count:
         fields["success"] = bool(np.nanmax(rows.read([success], first, span[1])[success]) > 0)
-    names = tuple(columns)
-    time = next((label for label, inner in columns.items() if inner == _TIME), "")
-    if not time:
-        time, names = "time", (*names, "time")
+    time = next((label for label, inner in columns.items() if inner == _TIME), "time")
+    names = tuple(dict.fromkeys([*columns, time]))
 
     def read(labels: Sequence[str], start: int, stop: int) -> dict[str, Column]:
         inner = [columns[label] for label in labels if label in columns]
         cells = rows.read(inner, first + start, first + stop) if inner else {}
-        table = {label: cells[columns[label]] for label in labels if label in columns}
-        if "time" in labels and "time" not in columns:
-            table["time"] = np.arange(start, stop) / float(facts["fps"])
-        if stop == count:
-            for label in table:
-                if label.startswith("action:") or label == "reward":
-                    table[label] = np.append(table[label][:-1], np.nan)
-        return {label: table[label] for label in labels}
+        table = {}
+        for label in labels:
+            if label in columns:
+                table[label] = cells[columns[label]]
+            else:
+                table[label] = np.arange(start, stop) / float(facts["fps"])
+            if stop == count and (label.startswith("action:") or label == "reward"):
+                table[label] = np.append(table[label][:-1], np.nan)
+        return table
 
     return Recording(name, source, {"": Topic(names, count, read, time)}, fields)
 
@@ -157,11 +154,9 @@ def _label(feature: str, item: str) -> str:
     if head not in {"observation", "action"}:
         return f"{feature}.{item}" if item else feature
     kind = "obs" if head == "observation" else head
-    if rest in {"", "state"}:
-        return (
-            f"{kind}:{rest or head}.{item}" if item.isdigit() else f"{kind}:{item or rest or head}"
-        )
-    return f"{kind}:{rest}.{item}" if item else f"{kind}:{rest}"
+    if rest in {"", "state"} and not item.isdigit():
+        return f"{kind}:{item or rest or head}"
+    return f"{kind}:{rest or head}.{item}" if item else f"{kind}:{rest}"
 
 
 def _flat(names: Any) -> list[str]:
@@ -201,14 +196,12 @@ def _entries(path: Path) -> list[dict[str, Any]]:
 
 def _tasks(path: Path) -> dict[int, Facts]:
     """Return the tasks of version 3, whose text is a column or the table's index."""
-    if not path.exists():
-        return {}
-    tasks: dict[int, Facts] = {}
-    for row in _entries(path):
-        text = next((row[k] for k in ("task", "__index_level_0__") if k in row), None)
-        if isinstance(row.get("task_index"), int):
-            tasks[row["task_index"]] = {"task": text}
-    return tasks
+    rows = _entries(path) if path.exists() else []
+    return {
+        row["task_index"]: {"task": row.get("task", row.get("__index_level_0__"))}
+        for row in rows
+        if isinstance(row.get("task_index"), int)
+    }
 
 
 READER: Final = Reader(

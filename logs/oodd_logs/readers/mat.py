@@ -31,10 +31,9 @@ def _open(path: Path, options: Options) -> Iterator[Recording]:
     transposed = is_transposed(path, options)
     plain = {}
     for name, array in arrays.items():
-        if array.size == 1 or 1 in array.shape:
+        plain[name] = array.T if transposed else array
+        if 1 in array.shape:
             plain[name] = array.ravel() if array.size > 1 else array.reshape(())
-        else:
-            plain[name] = array.T if transposed else array
     topic, fields = episode_of(plain, str(path))
     yield Recording(path.stem, str(path), {"": topic}, fields)
 

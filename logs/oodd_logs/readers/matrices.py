@@ -71,7 +71,11 @@ def episode_of(
     TrajectoryError
         When there are no rows, or lengths differ.
     """
-    names = {name: _kind(name) for name in arrays}
+    names: dict[str, str] = {}
+    for name in arrays:
+        head = name.partition("/")[0]
+        kind = "obs" if head in _OBSERVATIONS else "action" if head in _ACTIONS else ""
+        names[name] = "reward" if name in _REWARDS else kind
     observed = {len_of(arrays[n]) for n, kind in names.items() if kind == "obs"}
     if len(observed) > 1:
         raise TrajectoryError(f"{source}: observations have {sorted(observed)} rows")
@@ -122,15 +126,6 @@ def episode_of(
         return columns
 
     return Topic(tuple(labels), rows, read), fields
-
-
-def _kind(name: str) -> str:
-    head, _, rest = name.partition("/")
-    if head in _OBSERVATIONS:
-        return "obs"
-    if head in _ACTIONS:
-        return "action"
-    return "reward" if name in _REWARDS and not rest else ""
 
 
 def _label(name: str, kind: str, i: int, width: int | None, known: Sequence[Quantity]) -> str:

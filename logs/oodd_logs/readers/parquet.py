@@ -81,17 +81,22 @@ class ParquetRows:
         self._streams[key] = stream  # the last one used stands last
         while len(self._streams) > _STREAMS:
             self._streams.pop(next(iter(self._streams))).batches.close()
-        return {name: _joined([part[name] for part in parts], name, self.path) for name in names}
+        columns: dict[str, Column] = {}
+        for name in names:
+            cells = [part[name] for part in parts] or [np.empty(0)]
+            size = sum(part.size for part in cells) * max(part.itemsize for part in cells)
+            if cells[0].dtype.kind == "U" and size > EPISODE.most:
+                raise TrajectoryError(f"{self.path}, column {name!r}: texts take {size} bytes")
+            columns[name] = np.concatenate(cells) if len(cells) > 1 else cells[0]
+        return columns
 
     def _batches(self, leaves: Mapping[str, _Leaf], group: int) -> Generator[dict[str, Column]]:
         columns = [*dict.fromkeys(leaf.column for leaf in leaves.values())]
         with self._opened() as file:
             groups = range(group, len(self._starts) - 1)
             for batch in file.iter_batches(batch_size=_BATCH, row_groups=groups, columns=columns):
-                yield {
-                    name: _values(batch.column(leaf.column), leaf, self.path)
-                    for name, leaf in leaves.items()
-                }
+                cells = {name: batch.column(leaf.column) for name, leaf in leaves.items()}
+                yield {name: _values(cells[name], leaf, self.path) for name, leaf in leaves.items()}
 
     def _opened(self) -> Any:
         # By default the library keeps all that it has read of the file.
@@ -189,15 +194,6 @@ def _values(array: Any, leaf: _Leaf, path: Path) -> Column:
         array, per_second = array.cast(pa.int64()), _PER_SECOND[kind.unit]
     numbers = array.cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False)
     return np.asarray(numbers) / per_second
-
-
-def _joined(parts: list[Column], name: str, path: Path) -> Column:
-    if not parts:
-        return np.empty(0)
-    size = sum(part.size for part in parts) * max(part.itemsize for part in parts)
-    if parts[0].dtype.kind == "U" and size > EPISODE.most:
-        raise TrajectoryError(f"{path}, column {name!r}: texts take {size} bytes")
-    return np.concatenate(parts) if len(parts) > 1 else parts[0]
 
 
 def _open(path: Path, _options: Options) -> Iterator[Recording]:

@@ -104,10 +104,10 @@ def table(path: Path, options: Options, separator: str = "") -> Topic:
         parts: list[Any] = [block[i] for block in blocks]
         if i in worded:
             columns[name] = texts([*itertools.chain(*parts)], f"{path}, column {name!r}")
-            continue
-        column = np.concatenate([np.empty(0), *parts])
-        if name != f"column {i + 1}" or not len(column) or not np.isnan(column).all():
-            columns[name] = column
+        else:
+            column = np.concatenate([np.empty(0), *parts])
+            if name != f"column {i + 1}" or not len(column) or not np.isnan(column).all():
+                columns[name] = column
     return Topic.of(columns)
 
 
@@ -157,19 +157,25 @@ def layout_of(path: Path, options: Options, separator: str = "") -> Layout:
         raise TrajectoryError(f"{path} is empty, expected a line with names of columns, and rows")
     decimal = _decimal(rows, mark_of_cells, options)
     head = rows[0]
-    header = options.get("header", not _is_data(head, decimal))
+    # A row of values has numbers, and perhaps times, and nothing else.
+    words = [cell for cell in head if numbers([cell], decimal) is None]
+    is_data = len(words) < len(head) and all(map(_DATE.match, words)) and any(map(str.strip, head))
+    header = options.get("header", not is_data)
     if not isinstance(header, bool):
         raise UsageError(f"header is {header!r}, expected true or false")
     names: Sequence[str] = [*map(str, range(len(head)))]
     if header:
-        names, first = head, first + _lines_of_header(lines, mark_of_cells)
+        names = head
+        # Names may have line ends within quotes.
+        reader = csv.reader(lines, delimiter=mark_of_cells)
+        next(reader, None)
+        first += 1 if mark_of_cells == BLANKS else max(1, reader.line_num)
     elif comment.startswith(("#", "%")) and "header" not in options:
         above = _split([comment[1:].lstrip()], mark_of_cells)[0]
         names = above if len(above) == len(head) else names
     if header and re.match(r"[#%]\s", names[0]):
         names = [names[0][1:], *names[1:]]
-        following = rows[1:2]
-        if not names[0].strip() and following and len(following[0]) == len(names) - 1:
+        if not names[0].strip() and [len(row) for row in rows[1:2]] == [len(names) - 1]:
             names = names[1:]
     return Layout(mark_of_cells, decimal, encoding, first, _names(options, names, len(names), path))
 
@@ -312,29 +318,18 @@ def _line_of(text: str, i: int, separator: str) -> int:
     lines = io.StringIO(text).readlines()
     if separator == BLANKS:
         return [n for n, line in enumerate(lines, start=1) if line.split()][i]
-    reader, rows = csv.reader(lines, delimiter=separator, skipinitialspace=True), 0
-    for row in reader:
-        rows += bool(row and (len(row) > 1 or row[0].strip()))
-        if rows > i:
-            break
+    reader = csv.reader(lines, delimiter=separator, skipinitialspace=True)
+    filled = (row for row in reader if row and (len(row) > 1 or row[0].strip()))
+    next(itertools.islice(filled, i, None))
     return reader.line_num
-
-
-def _lines_of_header(lines: Sequence[str], separator: str) -> int:
-    """Return how many lines the first row takes: names may have line ends within quotes."""
-    if separator == BLANKS:
-        return 1
-    reader = csv.reader(lines, delimiter=separator)
-    next(reader, None)
-    return max(1, reader.line_num)
 
 
 def _separator(lines: Sequence[str], options: Options, default: str) -> str:
     """Return the separator of the options, of the format, or the first that fits the lines."""
     separator = options.get("separator", default)
+    if separator == "\\t":
+        return "\t"
     if separator:
-        if separator == "\\t":
-            return "\t"
         if not isinstance(separator, str) or len(separator) != 1 or separator in '"\n\r':
             expected = "one character, such as ';'"
             raise UsageError(f"separator is {separator!r}, expected {expected}")
@@ -358,12 +353,6 @@ def _decimal(rows: Sequence[Sequence[str]], separator: str, options: Options) ->
     if points or separator == ",":
         return "."
     return "," if any(map(_DECIMAL_COMMA.fullmatch, cells)) else ""
-
-
-def _is_data(cells: Sequence[str], decimal: str) -> bool:
-    """Tell whether a row holds values: numbers, and perhaps times, and nothing else."""
-    others = [c for c in cells if numbers([c], decimal) is None]
-    return len(others) < len(cells) and all(map(_DATE.match, others)) and any(map(str.strip, cells))
 
 
 def _names(options: Options, names: Sequence[str], count: int, path: Path) -> tuple[str, ...]:

@@ -43,22 +43,16 @@ def _blocks(path: Path, options: Options) -> Iterator[Recording]:
     for is_label, group in itertools.groupby(parsed, lambda pair: pair[1] is None):
         if is_label:
             label = " ".join([*group][-1][0].split())
-        else:
-            yield _block(path, options, label, [row for _, row in group if row], count)
-            count += 1
-
-
-def _block(
-    path: Path, options: Options, label: str, rows: list[list[float]], count: int
-) -> Recording:
-    source = f"{path}, block {count}"
-    if len({*map(len, rows)}) > 1:
-        raise TrajectoryError(f"{source} has rows of {sorted({*map(len, rows)})} numbers")
-    names = column_names(options.get("names") or map(str, range(len(rows[0]))))
-    if len(names) != len(rows[0]):
-        raise TrajectoryError(f"{source} has {len(rows[0])} columns, expected {len(names)}")
-    topic = Topic.of(dict(zip(names, np.array(rows).T, strict=True)))
-    return Recording(f"{path.stem}-{count}", source, {"": topic}, {"class": label})
+            continue
+        source, rows = f"{path}, block {count}", [row for _, row in group if row]
+        if len({*map(len, rows)}) > 1:
+            raise TrajectoryError(f"{source} has rows of {sorted({*map(len, rows)})} numbers")
+        names = column_names(options.get("names") or map(str, range(len(rows[0]))))
+        if len(names) != len(rows[0]):
+            raise TrajectoryError(f"{source} has {len(rows[0])} columns, expected {len(names)}")
+        topic = Topic.of(dict(zip(names, np.array(rows).T, strict=True)))
+        yield Recording(f"{path.stem}-{count}", source, {"": topic}, {"class": label})
+        count += 1
 
 
 def _row(line: str) -> list[float] | None:
