@@ -259,7 +259,7 @@ def _read(reading: "_Reading", recordings: Iterable[Recorded]) -> EpisodeSource:
     try:
         for recorded in recordings:
             _add(reading, recorded)
-        return _every_episode(reading) if reading.every else _in_parts(reading)
+        return _in_parts(reading)
     except BaseException:
         if reading.first:
             reading.first.spool.close()
@@ -684,18 +684,15 @@ def _keep(reading: _Reading, facts: EpisodeFacts) -> None:
     episodes.append(facts)
 
 
-def _every_episode(reading: _Reading) -> EpisodeSource:
-    """Return all episodes as one part, in the order of stamps if these tell it."""
-    source = _source(reading, reading.parts)
-    if reading.by_stamps:
-        reading.parts[EVERY].sort(key=lambda facts: facts.begin)
-    source.notes += reading.tally.lines()
-    return source
-
-
 def _in_parts(reading: _Reading) -> EpisodeSource:
-    """Return all episodes, in parts."""
+    """Return all episodes, in their parts, or in one in the order of stamps if these tell it."""
     recipe, selections = reading.recipe, reading.selections
+    if reading.every:
+        source = _source(reading, reading.parts)
+        if reading.by_stamps:
+            source.parts[EVERY].sort(key=lambda facts: facts.begin)
+        source.notes += reading.tally.lines()
+        return source
     if reading.first is None:
         raise UsageError("there are no recordings to read, expected at least one")
     reading.intervals.check_all_used(reading.names)
@@ -706,12 +703,13 @@ def _in_parts(reading: _Reading) -> EpisodeSource:
     for problem in reading.problems:
         raise TrajectoryError(problem)
     parts = _shared_out(reading)
-    for part in (TRAIN, CALIBRATION):
-        if not parts[part]:
-            raise UsageError(
-                f"there are no {part} episodes, expected at least 1: "
-                f"{_nominal_problem(reading, part)}"
-            )
+    for part in (part for part in (TRAIN, CALIBRATION) if not parts[part]):
+        why = f"[nominal] names no file with one for {part}"
+        if left_out := [counted(n, what) for what, n in reading.tally.left_out.items() if n]:
+            why = f"left out are {', '.join(left_out)}"
+        if count := len(reading.parts.get(FILES, ())):
+            why = f"the nominal files make {count}; a window cuts long recordings into several"
+        raise UsageError(f"there are no {part} episodes, expected at least 1: {why}")
     kinds = in_order(
         (part.removeprefix("test/") for part in reading.parts if part not in NOMINAL_ROLES),
         ANOMALIES,
@@ -748,14 +746,6 @@ def _source(reading: _Reading, parts: dict[str, list[EpisodeFacts]]) -> EpisodeS
         rate,
         parts,
     )
-
-
-def _nominal_problem(reading: _Reading, part: str) -> str:
-    if count := len(reading.parts.get(FILES, ())):
-        return f"the nominal files make {count}; a window cuts long recordings into several"
-    if left_out := [counted(n, what) for what, n in reading.tally.left_out.items() if n]:
-        return f"left out are {', '.join(left_out)}"
-    return f"[nominal] names no file with one for {part}"
 
 
 def _shared_out(reading: _Reading) -> dict[str, list[EpisodeFacts]]:

@@ -180,21 +180,13 @@ def import_data(
         kind: AnomalousFiles(files=files[kind], group=group_of.get(kind, "dynamics"))
         for kind in in_order(kinds, ANOMALIES)
     }
-    nominal = NominalFiles(
-        train=_files_of(form, train),
-        calibration=_files_of(form, calibration),
-        twins=files.get("nominal", ()),
-    )
-    recipe = Recipe(
-        name,
-        environment,
-        discrete=discrete,
-        paired=True,
-        format=form,
-        intervals=tuple(_onsets(tests[kind] for kind in kinds)),
-        nominal=nominal,
-        anomalous=anomalous,
-    )
+    fits, thresholds = (_files_of(form, part) for part in (train, calibration))
+    twins = files.get("nominal", ())
+    nominal = NominalFiles(train=fits, calibration=thresholds, twins=twins)
+    onsets = tuple(_onsets(tests[kind] for kind in kinds))
+    keys: dict[str, Any] = {"discrete": discrete, "paired": True, "format": form}
+    keys |= {"intervals": onsets, "nominal": nominal, "anomalous": anomalous}
+    recipe = Recipe(name, environment, **keys)
     recipe.check()
     named = _with_names(recipe, sensors, actions)
     return import_recipe(named, Path(), output, replace=replace, progress=progress, report=report)
@@ -262,10 +254,8 @@ def _with_names(recipe: Recipe, sensors: Sequence[Quantity], actions: Sequence[Q
         raise UsageError(f"{path} has no episodes, expected at least one")
     chosen = select_columns(layout_of(recording), recipe, recording.source)
     names: dict[str, Any] = {}
-    for kind, columns, quantities in (
-        ("sensors", chosen.sensors, sensors),
-        ("actions", chosen.actions, actions),
-    ):
+    for kind, quantities in (("sensors", sensors), ("actions", actions)):
+        columns = getattr(chosen, kind)
         named = [quantity.name for quantity in quantities]
         choices = recipe.discrete or recording.fields.get("discrete", 0)
         discrete = kind == "actions" and bool(named and choices)
@@ -389,7 +379,7 @@ class _Target:
             return cls(recipe, directory, {}, replace)
         manifest = layout.read_manifest(directory)
         name, environment = recipe.split, recipe.environment
-        if manifest["definition"] != _definition(name):
+        if manifest["definition"] != {"name": name, "source": IMPORTED}:
             raise UsageError(
                 f"{str(directory)!r} holds the split {manifest['name']!r}, which was not imported "
                 f"as {name!r}: choose another name"
@@ -404,17 +394,10 @@ class _Target:
     def write(self, source: EpisodeSource, progress: Say, report: Say) -> Split:
         """Write the episodes as the environment, and the manifest."""
         recipe, environment = self.recipe, self.recipe.environment
-        facts = LogFacts(
-            paired=recipe.paired,
-            clock=recipe.clock,
-            baseline=recipe.baseline,
-            rate=source.rate,
-            order=recipe.order,
-            offsets=source.offsets,
-            source=recipe.source,
-            licence=recipe.licence,
-            citation=recipe.citation,
-        )
+        keys = ("paired", "clock", "baseline", "order", "source", "licence", "citation")
+        said = {key: getattr(recipe, key) for key in keys}
+        facts = LogFacts(rate=source.rate, offsets=source.offsets, **said)
+        own = layout.own_facts(environment, discrete=source.discrete, groups=source.groups)
         with only_writer(self.directory):
             # Another import may have added an environment meanwhile.
             entries = self.of(recipe, self.directory, replace=self.replace).entries
@@ -424,23 +407,18 @@ class _Target:
                 IMPORTED,
                 sensors=source.sensors,
                 actions=source.actions,
-                custom=layout.own_facts(
-                    environment, discrete=source.discrete, groups=source.groups
-                ),
+                custom=own,
                 # What earlier versions could import keeps its digest.
                 logs=None if facts == LogFacts() else facts,
             )
             entries = {**entries, environment: entry}
             ordered = {name: entries[name] for name in in_order(entries, ENVIRONMENTS)}
             versions = {"oodd-eval": __version__, "numpy": np.__version__}
-            layout.write_manifest(self.directory, _definition(recipe.split), ordered, 0, versions)
+            definition = {"name": recipe.split, "source": IMPORTED}
+            layout.write_manifest(self.directory, definition, ordered, 0, versions)
         for line in source.notes:
             report(line)
         return Split(self.directory)
-
-
-def _definition(name: str) -> dict[str, str]:
-    return {"name": name, "source": IMPORTED}
 
 
 def _groups(source: EpisodeSource, progress: Say, *, paired: bool) -> Iterator[tuple[str, _Arrays]]:
@@ -507,8 +485,7 @@ def _with_twins(source: EpisodeSource, part: str, episodes: Sequence[EpisodeFact
             "without paired = true"
         )
     ordered = [by_name[name] for name in twins]
-    pairs = zip(ordered, twins.values(), strict=True)
-    effects = [_effect(source, episode, twin) for episode, twin in pairs]
+    effects = [_effect(source, by_name[name], twin) for name, twin in twins.items()]
     drawn = [dict(facts.fields.get("parameters", {})) for facts in ordered]
     return _rows(source, ordered) | {
         "onsets": np.array([facts.intervals[0][0] for facts in ordered], np.int64),
@@ -519,29 +496,28 @@ def _with_twins(source: EpisodeSource, part: str, episodes: Sequence[EpisodeFact
 
 
 def _by_name(part: str, episodes: Sequence[EpisodeFacts]) -> dict[str, EpisodeFacts]:
-    by_name = {facts.name: facts for facts in episodes}
-    if len(by_name) < len(episodes):
-        names = [facts.name for facts in episodes]
-        double = next(name for name in names if names.count(name) > 1)
-        raise TrajectoryError(f"{part} has two episodes named {double!r}, expected one of each")
+    by_name: dict[str, EpisodeFacts] = {}
+    for facts in episodes:
+        if by_name.setdefault(facts.name, facts) is not facts:
+            name = repr(facts.name)
+            raise TrajectoryError(f"{part} has two episodes named {name}, expected one of each")
     return by_name
 
 
 def _effect(source: EpisodeSource, episode: EpisodeFacts, twin: EpisodeFacts) -> int:
     """Return the first row from the onset on that differs from the twin's."""
     common, width = min(episode.rows, twin.rows), len(source.sensors)
-    if not episode.intervals or episode.intervals[0][0] < 0:
+    row = onset = episode.intervals[0][0] if episode.intervals else -1
+    if onset < 0:
         raise TrajectoryError(
             f"{episode.source} has no onset, the first row that may differ, expected 'onset' in "
             "the file, a line of onsets.csv beside it, or labels, intervals or onset in a recipe"
         )
-    onset = episode.intervals[0][0]
     if onset >= common:
         raise TrajectoryError(
             f"{episode.source}: the onset is row {onset}, expected 0 to {common - 1}, the last row "
             "that the episode and its twin both have"
         )
-    row = onset
     for blocks in zip(source.blocks(episode, onset), source.blocks(twin, onset), strict=False):
         rows, nominal = (block[: common - row, :width].astype(np.float32) for block in blocks)
         differs = (rows != nominal).any(axis=1)

@@ -69,12 +69,9 @@ def anomalous_cells(values: Column, recipe: Recipe, *, before: bool) -> NDArray[
         wrong = np.array([text.strip().lower() not in texts for text in known.tolist()], bool)
         return np.asarray(wrong[codes], bool)
     numbers = [float(v) for v in nominal if isinstance(v, int | float)] if nominal else [0.0]
-    missing = np.isnan(values)
-    anomalous = ~np.isin(values, numbers)
-    if missing.any():
-        held = np.maximum.accumulate(np.where(missing, -1, np.arange(len(values))))
-        anomalous = np.where(held < 0, before, anomalous[held])
-    return np.asarray(anomalous, bool)
+    present = np.where(np.isnan(values), -1, np.arange(len(values)))
+    held = np.maximum.accumulate(present)
+    return np.asarray(np.where(held < 0, before, ~np.isin(values, numbers)[held]), bool)
 
 
 def runs_of(anomalous: NDArray[np.bool_]) -> list[tuple[int, int]]:
@@ -198,22 +195,17 @@ def read_intervals(path: Path) -> list[Interval]:
             "and onset"
         )
     intervals = []
-    for line, row in rows:
-        if not any(row):
-            continue
+    for line, row in ((line, row) for line, row in rows if any(row)):
         cells = dict(itertools.zip_longest(header, row[: len(header)], fillvalue=""))
-        if (
-            not cells["file"]
-            or any(row[len(header) :])
-            or (start == "onset" and natural(cells[start]) < 0)
-        ):
+        is_no_row = start == "onset" and natural(cells[start]) < 0
+        if not cells["file"] or any(row[len(header) :]) or is_no_row:
             raise TrajectoryError(
                 f"{path}, line {line}: {row}, expected the columns file and {start}, a row or time"
             )
         first, last = _moment(cells[start]), _moment(cells.get("stop", ""))
         intervals.append((cells["file"], first, last, cells.get("kind", "")))
-    if start == "onset" and len({row[0] for row in intervals}) < len(intervals):
-        names = [row[0] for row in intervals]
+    names = [row[0] for row in intervals]
+    if start == "onset" and len({*names}) < len(names):
         double = next(name for name in names if names.count(name) > 1)
         raise TrajectoryError(f"{path} names {double!r} twice, expected one onset a file")
     return intervals

@@ -161,8 +161,8 @@ def select_columns(layout: Layout, recipe: Recipe, source: str) -> Selection:
     used = [*sensors, *actions, *rewards[:1], *labels.values()]
     times = _times(layout, dict.fromkeys(column.topic for column in used), recipe.time, source)
     named = {(c.topic, c.column) for c in (*used, *fields, *times.values())}
-    columns_ = [(topic, name) for topic, names, _ in layout for name in names]
-    unused = tuple(_aliases(*column)[-1] for column in columns_ if column not in named)
+    layout_columns = [(topic, name) for topic, names, _ in layout for name in names]
+    unused = tuple(_aliases(*column)[-1] for column in layout_columns if column not in named)
     if by_prefix:
         _check_spelling(source, unused)
     reward = rewards[0] if rewards else None
