@@ -397,7 +397,9 @@ class _Target:
         keys = ("paired", "clock", "baseline", "order", "source", "licence", "citation")
         said = {key: getattr(recipe, key) for key in keys}
         facts = LogFacts(rate=source.rate, offsets=source.offsets, **said)
-        own = layout.own_facts(environment, discrete=source.discrete, groups=source.groups)
+        environment_facts = layout.own_facts(
+            environment, discrete=source.discrete, groups=source.groups
+        )
         with only_writer(self.directory):
             # Another import may have added an environment meanwhile.
             entries = self.of(recipe, self.directory, replace=self.replace).entries
@@ -407,7 +409,7 @@ class _Target:
                 IMPORTED,
                 sensors=source.sensors,
                 actions=source.actions,
-                custom=own,
+                custom=environment_facts,
                 # What earlier versions could import keeps its digest.
                 logs=None if facts == LogFacts() else facts,
             )

@@ -36,10 +36,10 @@ def test_wheel_ships_data_policies_and_types(wheel):
         "oodd_riqn/py.typed",
         "oodd_recording/train/train.py",
         "oodd_eval/data/shipped/mini/manifest.json",
-        "checks/oodd_checks/template/templates/pyproject.toml.in",
-        "checks/oodd_checks/template/templates/gitignore.in",
-        "oodd_eval/leaderboard/published.jsonl.xz",
-        *(f"oodd_eval/data/recipes/{path.name}" for path in (ROOT / "recipes").glob("*.toml")),
+        "oodd_checks/template/templates/pyproject.toml.in",
+        "oodd_checks/template/templates/gitignore.in",
+        "oodd_leaderboard/published.jsonl.xz",
+        *(f"oodd_logs/recipes/{path.name}" for path in (ROOT / "recipes").glob("*.toml")),
     } <= names
     assert "oodd_recording/frozen/ant.npz" in names
 
