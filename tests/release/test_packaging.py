@@ -32,7 +32,7 @@ def test_wheel_ships_data_policies_and_types(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     assert {
         "oodd_eval/py.typed",
-        "oodd_common/py.typed",
+        *(f"oodd_{name}/py.typed" for name in ("checks", "common", "leaderboard", "live", "logs")),
         "oodd_riqn/py.typed",
         "oodd_recording/train/train.py",
         "oodd_eval/data/shipped/mini/manifest.json",
@@ -86,7 +86,7 @@ def test_the_wheel_has_no_tests_and_the_licence(distributions):
     assert not parts & {"tests", "docs", "benchmarks", "__pycache__", ".work", "conftest.py"}
     # Checks of detectors are part of the product, and they alone.
     modules = {str(Path(name).parent) for name in names if Path(name).name.startswith("test_")}
-    assert modules == {"checks/oodd_checks/conformance"}
+    assert modules == {"oodd_checks/conformance"}
 
 
 def test_metadata_say_what_the_project_says(distributions):
