@@ -604,11 +604,11 @@ def _parts_of(
 ) -> list[str]:
     """Return the parts that an episode of a recording belongs to."""
     source, recipe, tally = recorded.source, reading.recipe, reading.tally
+    if kind:
+        return [f"test/{kind}"]
     nominal = sorted(roles & NOMINAL_ROLES)
     kinds = {role.removeprefix("test/") for role in roles - NOMINAL_ROLES}
     labelled = {name for *_, name in inside}
-    if kind:
-        return [f"test/{kind}"]
     if reading.every:
         if inside:
             named = [name for *_, name in inside if name]

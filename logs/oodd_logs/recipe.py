@@ -458,24 +458,20 @@ class Recipe:
             raise UsageError(
                 f"{source}: [nominal] names train, but no calibration, which thresholds need"
             )
-        if self.paired:
-            self._check_paired(source)
-        elif nominal.twins:
-            raise UsageError(f"{source}: [nominal] names twins, expected paired = true with them")
-        if self.gap is not None and not self.time and self.rate is None:
-            raise UsageError(f"{source}: gap needs stamps: name their column with time")
-        if self.stop is not None and self.onset is None:
-            raise UsageError(f"{source}: stop is the end of what onset begins: name onset, too")
-
-    def _check_paired(self, source: str) -> None:
-        if self.anomalous and not self.nominal.twins:
+        if self.paired and self.anomalous and not nominal.twins:
             raise UsageError(
                 f"{source}: paired = true needs [nominal] twins: nominal episodes, each of which "
                 "has the file name of the anomalous one that it is compared with"
             )
         for key in ("window", "baseline", "outcome", "kinds", "task"):
-            if getattr(self, key):
+            if self.paired and getattr(self, key):
                 raise UsageError(f"{source}: paired = true and {key} exclude each other")
+        if nominal.twins and not self.paired:
+            raise UsageError(f"{source}: [nominal] names twins, expected paired = true with them")
+        if self.gap is not None and not self.time and self.rate is None:
+            raise UsageError(f"{source}: gap needs stamps: name their column with time")
+        if self.stop is not None and self.onset is None:
+            raise UsageError(f"{source}: stop is the end of what onset begins: name onset, too")
 
 
 _Reader = Callable[[str, Any], Any]

@@ -244,11 +244,16 @@ class Converter:
         names = [quantity.name for quantity in quantities]
         matches_any(recipe.angles, names, "sensor that is an angle")
         self._angles = [matches_any(recipe.angles, [name]) for name in names]
-        self.sensors = tuple(
-            turned
-            for quantity, angle in zip(quantities, self._angles, strict=True)
-            for turned in (_sine_and_cosine(quantity) if angle else (quantity,))
-        )
+        sensors: list[Quantity] = []
+        for quantity, is_angle in zip(quantities, self._angles, strict=True):
+            if is_angle and quantity.unit not in {"1", "rad", *_FULL_TURN}:
+                raise UsageError(
+                    f"angles: {quantity.name!r} is in {quantity.unit}, expected rad or deg, as in "
+                    f"sensors = ['{quantity.name}[rad]']"
+                )
+            parts = [Quantity(f"{function} {quantity.name}", "1") for function in ("sin", "cos")]
+            sensors += parts if is_angle else [quantity]
+        self.sensors = tuple(sensors)
         self._scales = [np.pi / _FULL_TURN.get(q.unit, np.pi) for q in quantities]
         self._start = start
         self.actions = _actions(selection.actions, recipe)
@@ -304,15 +309,6 @@ class Converter:
                 f"{self._start} to {self._start + count - 1}"
             )
         return np.eye(count)[codes.astype(np.intp)]
-
-
-def _sine_and_cosine(quantity: Quantity) -> tuple[Quantity, Quantity]:
-    if quantity.unit not in {"1", "rad", *_FULL_TURN}:
-        raise UsageError(
-            f"angles: {quantity.name!r} is in {quantity.unit}, expected rad or deg, as in "
-            f"sensors = ['{quantity.name}[rad]']"
-        )
-    return Quantity(f"sin {quantity.name}", "1"), Quantity(f"cos {quantity.name}", "1")
 
 
 def _actions(columns: Sequence[ChosenColumn], recipe: Recipe) -> tuple[Quantity, ...]:
