@@ -428,7 +428,7 @@ def _add(reading: _Reading, recorded: Recorded) -> None:
     selection, first = _selected(reading, recording)
     reading.recordings += 1
     reading.names |= {recorded.relative, recording.name}
-    outcome, kind, task = _said_of(recorded, recipe, lenient=reading.every)
+    outcome, kind, task = _outcome_kind_and_task(recorded, recipe, lenient=reading.every)
     stamped = StampedRows(recorded, selection, recipe, reading.tally)
     marks = stamped.marks(reading.intervals, is_anomalous=bool(kind or recorded.kinds))
     stretches, times = stamped.stretches()
@@ -516,7 +516,9 @@ def _in_order(selection: Selection, first: _First, source: str) -> Selection:
     )
 
 
-def _said_of(recorded: Recorded, recipe: Recipe, *, lenient: bool) -> tuple[bool | None, str, str]:
+def _outcome_kind_and_task(
+    recorded: Recorded, recipe: Recipe, *, lenient: bool
+) -> tuple[bool | None, str, str]:
     """Return outcome, anomaly and task of a recording by its fields, None or empty without."""
 
     def value(name: str, *, last: bool = False) -> str | None:

@@ -180,9 +180,9 @@ def import_data(
         kind: AnomalousFiles(files=files[kind], group=group_of.get(kind, "dynamics"))
         for kind in in_order(kinds, ANOMALIES)
     }
-    fits, thresholds = (_files_of(form, part) for part in (train, calibration))
+    train_files, calibration_files = (_files_of(form, part) for part in (train, calibration))
     twins = files.get("nominal", ())
-    nominal = NominalFiles(train=fits, calibration=thresholds, twins=twins)
+    nominal = NominalFiles(train=train_files, calibration=calibration_files, twins=twins)
     onsets = tuple(_onsets(tests[kind] for kind in kinds))
     keys: dict[str, Any] = {"discrete": discrete, "paired": True, "format": form}
     keys |= {"intervals": onsets, "nominal": nominal, "anomalous": anomalous}
@@ -395,8 +395,8 @@ class _Target:
         """Write the episodes as the environment, and the manifest."""
         recipe, environment = self.recipe, self.recipe.environment
         keys = ("paired", "clock", "baseline", "order", "source", "licence", "citation")
-        said = {key: getattr(recipe, key) for key in keys}
-        facts = LogFacts(rate=source.rate, offsets=source.offsets, **said)
+        from_recipe = {key: getattr(recipe, key) for key in keys}
+        facts = LogFacts(rate=source.rate, offsets=source.offsets, **from_recipe)
         environment_facts = layout.own_facts(
             environment, discrete=source.discrete, groups=source.groups
         )

@@ -131,8 +131,8 @@ def _print(result: Scan, notes: Sequence[str], options: Options) -> None:
         console.print("")
         left = len(result.episodes) - len(listed)
         unlisted = f"Not listed: {counted(left, 'less odd episode(s)')} (-v lists all)."
-        said = [*notes, *result.notes, *_on_labels(result, fitted=not options.watchdog)]
-        for note in (_COLUMNS, *([unlisted] * (left > 0)), *said):
+        remarks = [*notes, *result.notes, *_on_labels(result, fitted=not options.watchdog)]
+        for note in (_COLUMNS, *([unlisted] * (left > 0)), *remarks):
             print_prose(note, console)
     console.print(Text(summary(result)))
     if result.odd and not options.html and options.verbosity >= 0:

@@ -154,8 +154,8 @@ def _draft_columns(logs: Inspection) -> Iterator[str]:
         yield "]"
         yield '# actions = ["cmd*"]  # what was commanded, if columns say so'
         wrapper = textwrap.TextWrapper(98, initial_indent="# ", subsequent_indent="#   ")
-        for reason, of_reason in _REASONS.items():
-            if names := [name for name, role in roles.items() if role in of_reason]:
+        for reason, excluded in _REASONS.items():
+            if names := [name for name, role in roles.items() if role in excluded]:
                 yield from wrapper.wrap(f"left out, {reason}: {listed(names, 40)}")
     facts = {name: logs.columns[name] for name in sensors}
     if flags := [name for name in sensors if facts[name].flag]:

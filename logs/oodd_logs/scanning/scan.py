@@ -314,8 +314,8 @@ def scan_episodes(
     judged = []
     for i, one in enumerate(usable):
         statistic = _statistic(handle.alarm, scores, _peers(usable, i), i)
-        said = scores[i], statistic, outcomes[i][1], faults[i]
-        judged.append(_Judged(one, *said, trajectories[i], baseline))
+        answer = scores[i], statistic, outcomes[i][1], faults[i]
+        judged.append(_Judged(one, *answer, trajectories[i], baseline))
     how = "each episode is judged by a fit that has not seen it."
     notes.insert(0, f"{counted(len(usable), 'episode(s)')}, {counted(len(folds), 'fit(s)')}: {how}")
     name = handle.state["name"] or type(handle.detector).__name__
