@@ -97,8 +97,8 @@ class GuaranteedAlarm:
         confidence: float | None = None,
     ) -> "list[GuaranteedAlarm]":
         """Find the thresholds of several levels as `fit` does, each episode's statistic once."""
-        known = Calibration.fit(calibration, kind)
-        return [known.rule(level, confidence) for level in levels]
+        fitted_calibration = Calibration.fit(calibration, kind)
+        return [fitted_calibration.rule(level, confidence) for level in levels]
 
     def statistic(self, scores: Floats) -> Floats:
         """Return the statistic of an episode, row by row; minus infinity where there is none."""
@@ -135,8 +135,8 @@ class Calibration:
 
     Examples
     --------
-    >>> known = Calibration.fit([np.array([peak]) for peak in range(1, 20)], "score")
-    >>> known.rule(0.05).threshold, known.joined(25.0).rule(0.10).threshold
+    >>> calibration = Calibration.fit([np.array([peak]) for peak in range(1, 20)], "score")
+    >>> calibration.rule(0.05).threshold, calibration.joined(25.0).rule(0.10).threshold
     (19.0, 25.0)
     """
 
@@ -165,7 +165,7 @@ class Calibration:
         if kind == "cusum":
             standardization, episodes = Standardization.fit(scores[0::2]), scores[1::2]
         unbounded = GuaranteedAlarm(standardization, math.inf)
-        largest = tuple(unbounded.largest(one) for one in episodes)
+        largest = tuple(unbounded.largest(episode) for episode in episodes)
         return cls(kind, standardization, largest, len(scores))
 
     @property
@@ -276,11 +276,13 @@ def too_few(
     >>> too_few("alpha=0.05", 30, 0.05, "cusum").partition(":")[0]
     'alpha=0.05 takes 38 calibration episodes, got 30'
     """
-    halved, whole = (least_episodes(level, one, confidence) for one in STATISTICS)
+    least_cusum, least_score = (
+        least_episodes(level, statistic, confidence) for statistic in STATISTICS
+    )
     return (
-        f"{subject} takes {whole if kind == 'score' else halved} calibration episodes, got "
-        f"{episodes}: {halved} for a CUSUM of the scores, which half of them standardize, "
-        f"{whole} for the detector's own score as the "
+        f"{subject} takes {least_score if kind == 'score' else least_cusum} calibration episodes, "
+        f"got {episodes}: {least_cusum} for a CUSUM of the scores, which half of them standardize, "
+        f"{least_score} for the detector's own score as the "
         "statistic; "
         "record more, or promise less"
     )

@@ -113,13 +113,13 @@ def _total(denominator: Floats, weights: Weights) -> Samples:
 
 def _medians(contribution: Contribution, weights: Weights) -> Samples:
     """Return the median in every resample: the mean of the two middle ones among even numbers."""
-    chosen = np.flatnonzero(contribution.denominator)
-    chosen = chosen[np.argsort(contribution.numerator[chosen], kind="stable")]
-    drawn = np.cumsum(weights.T[chosen], axis=0)
-    total = drawn[-1] if chosen.size else np.zeros(len(weights))
+    indices = np.flatnonzero(contribution.denominator)
+    indices = indices[np.argsort(contribution.numerator[indices], kind="stable")]
+    drawn = np.cumsum(weights.T[indices], axis=0)
+    total = drawn[-1] if indices.size else np.zeros(len(weights))
     # The k-th of all that are drawn, from 0, is the first with more than k up to it.
     low, high = ((drawn <= k).sum(axis=0) for k in ((total - 1) // 2, total // 2))
-    ordered = np.append(contribution.numerator[chosen], np.nan)  # with none drawn, k is beyond
+    ordered = np.append(contribution.numerator[indices], np.nan)  # with none drawn, k is beyond
     return np.asarray((ordered[low] + ordered[high]) / 2)
 
 
@@ -513,8 +513,8 @@ def sample_cells(cells: Sequence[DrawnCells]) -> Samples:
     several detectors or anomalies are paired.
     """
     by_seed: dict[int, list[CellSum]] = {}
-    for one in itertools.chain.from_iterable(c.sums for c in cells):
-        by_seed.setdefault(one.seed, []).append(one)
+    for cell_sum in itertools.chain.from_iterable(c.sums for c in cells):
+        by_seed.setdefault(cell_sum.seed, []).append(cell_sum)
     return mean_over_seeds([_mean_of(by_seed[seed]) for seed in sorted(by_seed)])
 
 

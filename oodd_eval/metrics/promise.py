@@ -354,10 +354,17 @@ def _figures(test: PermutationTest) -> str:
     return f"rank correlation {test.statistic:.2f}, p = {test.p:.2g}"
 
 
-def _length(known: NDArray[np.int64], others: NDArray[np.int64]) -> PromiseFinding:
-    test = two_sample_test(*(n[:, None].astype(np.float64) for n in (known, others)))
-    rows = f"{np.median(known):g} rows in the median, nominal test episodes {np.median(others):g}"
-    shorter = test.significant and bool(known.mean() < others.mean())
+def _length(
+    calibration_lengths: NDArray[np.int64], nominal_lengths: NDArray[np.int64]
+) -> PromiseFinding:
+    test = two_sample_test(
+        *(n[:, None].astype(np.float64) for n in (calibration_lengths, nominal_lengths))
+    )
+    rows = (
+        f"{np.median(calibration_lengths):g} rows in the median, "
+        f"nominal test episodes {np.median(nominal_lengths):g}"
+    )
+    shorter = test.significant and bool(calibration_lengths.mean() < nominal_lengths.mean())
     text = f"calibration episodes have {rows}"
     if shorter:
         text += f" (p = {test.p:.2g}): longer ones have more time to alarm than was promised for"

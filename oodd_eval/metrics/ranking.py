@@ -160,11 +160,11 @@ def rank(
         extended=expected > count,
     )
 
-    def tests(name: str, others: Sequence[str]) -> list[PairTest]:
+    def tests(name: str, other_names: Sequence[str]) -> list[PairTest]:
         results = []
-        differences = np.array([means[name] - means[other] for other in others])
-        tested = bootstrap.test(name, others, differences) if others else []
-        for other, d, t in zip(others, differences.tolist(), tested, strict=True):
+        differences = np.array([means[name] - means[other] for other in other_names])
+        tested = bootstrap.test(name, other_names, differences) if other_names else []
+        for other, d, t in zip(other_names, differences.tolist(), tested, strict=True):
             results.append(PairTest(name, other, d, t.low, t.high, t.p, math.nan))
             results.append(PairTest(other, name, -d, -t.high, -t.low, t.p_reverse, math.nan))
         return results
@@ -243,9 +243,9 @@ class _PairBootstrap:
             if calibrated:
                 self._shifts[i] += self._calibrations[i]
 
-    def test(self, name: str, others: Sequence[str], differences: Floats) -> list[_Tested]:
-        """Test a row against others, given the differences of its mean to theirs."""
-        row, columns = self._index[name], np.array([self._index[other] for other in others])
+    def test(self, name: str, other_names: Sequence[str], differences: Floats) -> list[_Tested]:
+        """Test a row against other rows, given the differences of its mean to theirs."""
+        row, columns = self._index[name], np.array([self._index[other] for other in other_names])
         effects = self._influences[row] - self._influences[columns]
         # Rounding alone must not look like a difference between seeds.
         effects = np.where(np.abs(effects) > NOISE, effects, 0.0)
@@ -340,9 +340,9 @@ def _draws(key: str, n: int, resamples: int) -> Floats:
     return np.ascontiguousarray(bootstrap_weights(n, key=key, resamples=resamples).T)
 
 
-def _corrected(tests: Sequence[PairTest], others: Sequence[PairTest]) -> list[PairTest]:
-    """Return tests with Holm's correction over them and others together."""
-    p = holm(np.array([c.p for c in (*tests, *others)]))
+def _corrected(tests: Sequence[PairTest], other_tests: Sequence[PairTest]) -> list[PairTest]:
+    """Return tests with Holm's correction over them and other tests together."""
+    p = holm(np.array([c.p for c in (*tests, *other_tests)]))
     return [replace(c, p_holm=float(corrected)) for c, corrected in zip(tests, p, strict=False)]
 
 
@@ -374,9 +374,9 @@ def tie_groups(names: Sequence[str], better: Iterable[tuple[str, str]]) -> list[
     [('a', 'b'), ('b', 'c')]
     """
     alike = {name: {*names} - {name} for name in names}
-    for one, other in better:
-        alike[one].discard(other)
-        alike[other].discard(one)
+    for better_name, worse_name in better:
+        alike[better_name].discard(worse_name)
+        alike[worse_name].discard(better_name)
     groups = _cliques(alike, [], {*names}, set()) if names else ()
     # By position, since names have an order of their own.
     positions = sorted(sorted(map(names.index, group)) for group in groups)

@@ -197,8 +197,8 @@ def _drawn(environment: str, terms: Floats) -> Floats:
     seeds, rungs, n = terms.shape
     weights = shared_weights(environment, n)
     by_seed = (terms.reshape(-1, n) @ weights.T).reshape(seeds, rungs, -1)
-    chosen = drawn_seeds(seeds, len(weights))
-    drawn = np.take_along_axis(by_seed, chosen[:, None], axis=0).sum(axis=0)
+    seed_indices = drawn_seeds(seeds, len(weights))
+    drawn = np.take_along_axis(by_seed, seed_indices[:, None], axis=0).sum(axis=0)
     return np.concatenate([terms.sum(axis=(0, 2))[:, None], drawn], axis=1)
 
 

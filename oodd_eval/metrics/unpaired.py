@@ -167,28 +167,28 @@ class _Placements(NamedTuple):
 
 def _placements(
     judged: Sequence[Floats],
-    chosen: Sequence[Mask],
+    masks: Sequence[Mask],
     references: Sequence[Floats],
     *,
     clock: bool,
     same: bool = False,
 ) -> _Placements:
-    """Compare chosen rows of judged episodes with those of reference episodes."""
+    """Compare the rows of judged episodes in their masks with those of reference episodes."""
     # If they are the `same`, judged episode k is reference k, with which it is not compared.
-    chosen = [mask & ~np.isnan(s) for mask, s in zip(chosen, judged, strict=True)]
+    masks = [mask & ~np.isnan(s) for mask, s in zip(masks, judged, strict=True)]
     if clock:
         present = np.zeros(max(map(len, (*judged, *references)), default=0), np.intp)
         for scores in references:
             present[: len(scores)] += ~np.isnan(scores)
         enough = present - same >= LEAST_NOMINAL
-        chosen = [mask & enough[: len(mask)] for mask in chosen]
+        masks = [mask & enough[: len(mask)] for mask in masks]
     elif not sum((~np.isnan(scores)).any() for scores in references) - same > 0:
-        chosen = [np.zeros_like(mask) for mask in chosen]
-    rows = np.array([np.count_nonzero(mask) for mask in chosen], np.intp)
+        masks = [np.zeros_like(mask) for mask in masks]
+    rows = np.array([np.count_nonzero(mask) for mask in masks], np.intp)
     sums, influences = np.zeros(len(rows)), np.zeros(len(references))
     used = np.zeros(len(references), dtype=bool)
     compare = _at_the_same_rows if clock else _at_all_rows
-    for compared in compare(judged, chosen, references):
+    for compared in compare(judged, masks, references):
         shares, changes = _shares_and_changes(compared, rows, same=same)
         sums += np.bincount(compared.episodes, shares, len(sums))
         influences += np.bincount(compared.others, changes, len(influences))
@@ -201,22 +201,22 @@ def _shares_and_changes(
 ) -> tuple[Floats, Floats]:
     """Return the share of references below each judged row, and what each reference changes."""
     # `rows` are those of each judged episode, all of which count alike.
-    judged, episodes, references, others = compared
+    judged, episodes, references, reference_episodes = compared
     below, rivals = _below(judged, references), np.full(len(judged), float(len(references)))
     if same:
         # Among keys that rise from episode to episode, the rows before are those of the episodes
         # before and those below in the same one.
         ranks = np.unique(np.concatenate([judged, references]), return_inverse=True)[1]
-        keys = np.concatenate([episodes, others]) * len(ranks) + ranks
+        keys = np.concatenate([episodes, reference_episodes]) * len(ranks) + ranks
         mine, theirs = np.split(keys, [len(judged)])
-        first, last = (np.searchsorted(others, episodes, side=s) for s in _SIDES)
+        first, last = (np.searchsorted(reference_episodes, episodes, side=s) for s in _SIDES)
         below -= _below(mine, theirs) - first
         rivals -= last - first
     shares = below / rivals
     weights = 1 / (rows[episodes] * rivals)
     changes = _changes(judged, shares, weights, references)
     if same:
-        start, stop = (np.searchsorted(episodes, others, side=s) for s in _SIDES)
+        start, stop = (np.searchsorted(episodes, reference_episodes, side=s) for s in _SIDES)
         # Relative to one half, so that ties everywhere give 0 without rounding.
         sums, beyond = (np.cumsum(np.append(0.0, w)) for w in (weights, weights * (shares - 0.5)))
         halves = (sums[start] + sums[stop]) / 2 - _below(theirs, mine, weights)
@@ -247,12 +247,12 @@ def _changes(judged: Floats, shares: Floats, weights: Floats, references: Floats
 
 
 def _at_all_rows(
-    judged: Sequence[Floats], chosen: Sequence[Mask], references: Sequence[Floats]
+    judged: Sequence[Floats], masks: Sequence[Mask], references: Sequence[Floats]
 ) -> Iterator[_Comparison]:
     """Compare every judged row with all rows of the references."""
-    values = [scores[mask] for scores, mask in zip(judged, chosen, strict=True)]
-    others = [scores[~np.isnan(scores)] for scores in references]
-    compared = _Comparison(*_pooled(values), *_pooled(others))
+    values = [scores[mask] for scores, mask in zip(judged, masks, strict=True)]
+    reference_values = [scores[~np.isnan(scores)] for scores in references]
+    compared = _Comparison(*_pooled(values), *_pooled(reference_values))
     if len(compared.judged) and len(compared.references):
         yield compared
 
@@ -263,17 +263,17 @@ def _pooled(parts: Sequence[Floats]) -> tuple[Floats, Indices]:
 
 
 def _at_the_same_rows(
-    judged: Sequence[Floats], chosen: Sequence[Mask], references: Sequence[Floats]
+    judged: Sequence[Floats], masks: Sequence[Mask], references: Sequence[Floats]
 ) -> Iterator[_Comparison]:
     """Compare judged rows t with rows t of the references, some rows at a time."""
-    last = max((len(mask) for mask in chosen), default=0)
+    last = max((len(mask) for mask in masks), default=0)
     for start in range(0, last, _BLOCK):
         block = slice(start, start + _BLOCK)
-        picked = [np.where(m, s, np.nan)[block] for s, m in zip(judged, chosen, strict=True)]
-        rows, others = _stacked(picked), _stacked([scores[block] for scores in references])
+        picked = [np.where(m, s, np.nan)[block] for s, m in zip(judged, masks, strict=True)]
+        rows, reference_rows = _stacked(picked), _stacked([scores[block] for scores in references])
         for t in np.flatnonzero(~np.isnan(rows).all(axis=0)):
-            i, j = (np.flatnonzero(~np.isnan(matrix[:, t])) for matrix in (rows, others))
-            yield _Comparison(rows[i, t], i, others[j, t], j)
+            i, j = (np.flatnonzero(~np.isnan(matrix[:, t])) for matrix in (rows, reference_rows))
+            yield _Comparison(rows[i, t], i, reference_rows[j, t], j)
 
 
 def _stacked(parts: Sequence[Floats]) -> Floats:
@@ -318,9 +318,9 @@ def _pool(cell: UnpairedScores) -> Contribution:
     placements = []
     for nominal, anomalous in cell.by_task():
         judged = [cell.anomalous[i] for i in anomalous]
-        chosen = [anomalous_rows(cell.intervals[i], len(cell.anomalous[i])) for i in anomalous]
+        masks = [anomalous_rows(cell.intervals[i], len(cell.anomalous[i])) for i in anomalous]
         references = [cell.nominal[j] for j in nominal]
-        of_task = _placements(judged, chosen, references, clock=cell.clock)
+        of_task = _placements(judged, masks, references, clock=cell.clock)
         placements.append((nominal, anomalous, of_task))
     return _of_both(cell, placements)
 
@@ -329,11 +329,11 @@ def _pool_null(cell: UnpairedScores) -> Contribution:
     shares, influences = np.full(len(cell.nominal), np.nan), np.zeros(len(cell.nominal))
     for nominal, anomalous in cell.by_task():
         judged = [cell.nominal[j] for j in nominal]
-        chosen = [
+        masks = [
             anomalous_rows(cell.intervals[i], len(cell.nominal[j]))
             for j, i in zip(nominal, itertools.cycle(anomalous), strict=False)
         ]
-        placements = _placements(judged, chosen, judged, clock=cell.clock, same=True)
+        placements = _placements(judged, masks, judged, clock=cell.clock, same=True)
         shares[nominal], influences[nominal] = placements.shares, placements.influences
     defined = ~np.isnan(shares)
     # One sample judges and is judged: an odd episode adds as much here as it takes there.
@@ -351,8 +351,8 @@ def _outcome(cell: UnpairedScores, statistic: GuaranteedAlarm) -> Contribution:
             [np.array([statistic.largest(part[k][:rows])]) for k in indices]
             for part, indices in ((cell.anomalous, failed), (cell.nominal, nominal))
         )
-        chosen = [np.ones(1, dtype=bool)] * len(failed)
-        of_task = _placements(judged, chosen, references, clock=False)
+        masks = [np.ones(1, dtype=bool)] * len(failed)
+        of_task = _placements(judged, masks, references, clock=False)
         placements.append((nominal, failed, of_task))
     return _of_both(cell, placements)
 
@@ -493,18 +493,20 @@ def _from_known(
     firsts: Sequence[int | None], episodes: Sequence[Floats], starts: Sequence[int]
 ) -> Metrics:
     """Return delays and shares of episodes with known starts; the others are undefined."""
-    known = [i for i, start in enumerate(starts) if start != UNKNOWN]
-    lengths = [len(episodes[i]) for i in known]
-    metrics = from_starts([firsts[i] for i in known], lengths, lengths, [starts[i] for i in known])
-    return {name: _spread(c, len(episodes), known) for name, c in metrics.items()}
+    indices = [i for i, start in enumerate(starts) if start != UNKNOWN]
+    lengths = [len(episodes[i]) for i in indices]
+    metrics = from_starts(
+        [firsts[i] for i in indices], lengths, lengths, [starts[i] for i in indices]
+    )
+    return {name: _spread(c, len(episodes), indices) for name, c in metrics.items()}
 
 
 def _drawn_starts(cell: UnpairedScores, starts: Sequence[int]) -> list[int]:
     """Return a start for each nominal test episode, from the anomalous ones of its task in turn."""
     drawn = [UNKNOWN] * len(cell.nominal)
     for nominal, anomalous in cell.by_task():
-        known = [starts[i] for i in anomalous if starts[i] != UNKNOWN]
-        for j, start in zip(nominal, itertools.cycle(known), strict=False):
+        known_starts = [starts[i] for i in anomalous if starts[i] != UNKNOWN]
+        for j, start in zip(nominal, itertools.cycle(known_starts), strict=False):
             drawn[j] = start
     return drawn
 
@@ -535,10 +537,10 @@ def _found_outcome(
     }
 
 
-def _task_weights(cell: UnpairedScores, chosen: Iterable[int]) -> Floats:
-    """Return weights of nominal episodes that give tasks the shares that chosen ones give them."""
+def _task_weights(cell: UnpairedScores, indices: Iterable[int]) -> Floats:
+    """Return weights of nominal episodes that give tasks the shares of the anomalous `indices`."""
     # They are 1 where there is one task.
-    weights, counts = np.zeros(len(cell.nominal)), {*chosen}
+    weights, counts = np.zeros(len(cell.nominal)), {*indices}
     for nominal, anomalous in cell.by_task():
         weights[nominal] = len(counts & {*anomalous}) / len(nominal)
     counted = np.count_nonzero(weights)
@@ -682,6 +684,6 @@ def _of_anomalous(cell: UnpairedScores, contribution: Contribution) -> Contribut
 def _spread(contribution: Contribution, size: int, at: Sequence[int]) -> Contribution:
     """Return terms at some of so many indices, 0 / 0 at the others."""
     numerator, denominator = np.zeros((2, size))
-    chosen = np.array(at, np.intp)
-    numerator[chosen], denominator[chosen] = contribution.numerator, contribution.denominator
+    indices = np.array(at, np.intp)
+    numerator[indices], denominator[indices] = contribution.numerator, contribution.denominator
     return Contribution(numerator, denominator)
