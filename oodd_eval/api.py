@@ -269,7 +269,7 @@ def _plain(parameters: Mapping[str, Any]) -> dict[str, Any]:
 
 def _without_numpy(value: Any) -> Any:
     if isinstance(value, Mapping):
-        return {name: _without_numpy(one) for name, one in value.items()}
+        return {name: _without_numpy(nested) for name, nested in value.items()}
     if type(value) in (list, tuple):
         return type(value)(map(_without_numpy, value))
     return value.item() if isinstance(value, np.generic) else value

@@ -63,17 +63,17 @@ def select(kind: str, patterns: str, known: Iterable[str]) -> list[str]:
     ['hopper', 'acrobot', 'ant']
     """
     names = list(known)
-    chosen: dict[str, None] = {}
+    selected: dict[str, None] = {}
     for pattern in (p.strip() for p in patterns.split(",")):
         if not pattern:
             continue
         matches = names if pattern == "all" else fnmatch.filter(names, pattern)
         if not matches:
             raise UnknownNameError(kind, pattern, names)
-        chosen.update(dict.fromkeys(matches))
-    if not chosen:
+        selected.update(dict.fromkeys(matches))
+    if not selected:
         raise UsageError(f"no {kind} was named: expected names separated by commas, or 'all'")
-    return list(chosen)
+    return list(selected)
 
 
 def natural(text: str) -> int:

@@ -44,12 +44,12 @@ class Table:
 
         Of several labels a first one stands where it changes: a group of columns has its name once.
         """
-        whole = [list(column) for column in zip(self.header, *self.rows, strict=True)]
-        header = whole[0]
+        columns = [list(column) for column in zip(self.header, *self.rows, strict=True)]
+        header = columns[0]
         if self.labels > 1:
             pairs = itertools.pairwise(header)
             header = [header[0], *("" if text == before else text for before, text in pairs)]
-        return replace(self, header=header, rows=whole[1:], labels=1, colours=())
+        return replace(self, header=header, rows=columns[1:], labels=1, colours=())
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,13 +145,13 @@ def print_table(table: Table, console: Console, width: int = 0) -> None:
 
 def _fitting(table: Table, width: int) -> list[Table]:
     """Return the table, the table turned, or parts of its columns, whichever first fits."""
-    whole = [table, table.transposed()]
+    candidates = [table, table.transposed()]
     if table.wrap:
-        whole += [_wrapped(one, width) for one in whole]
-        table = whole[-2]
-    for one in whole:
-        if _width(one) <= width:
-            return [one]
+        candidates += [_wrapped(candidate, width) for candidate in candidates]
+        table = candidates[-2]
+    for candidate in candidates:
+        if _width(candidate) <= width:
+            return [candidate]
     labels = list(range(table.labels))
     parts = [labels]
     for column in range(table.labels, len(table.header)):

@@ -185,15 +185,15 @@ class Board:
         intervals: bool,
     ) -> Value:
         everywhere = list(itertools.product(environments, anomalies))
-        chosen = [cell for cell in everywhere if cell in self._expected] or everywhere
+        counted_cells = [cell for cell in everywhere if cell in self._expected] or everywhere
         of_row, cells_of_row = self._rows[entry], self._cells[entry]
-        cells = [cells_of_row[cell] for cell in chosen if cell in cells_of_row]
+        cells = [cells_of_row[cell] for cell in counted_cells if cell in cells_of_row]
         indices = [i for cell in cells for i in cell]
         records = [of_row[i] for i in indices]
         blank = Value(
             state=next((r.status for r in records if not r.ok), ""),
             cells=len(records),
-            partial=0 < len(cells) < len(chosen),
+            partial=0 < len(cells) < len(counted_cells),
             brief=bool(records) and all(r.brief for r in records),
         )
         if blank.state:
@@ -216,7 +216,7 @@ class Board:
             for e, a in itertools.product(self.environments, self.anomalies)
             if not any(math.isnan(self.mean(s, [e], [a], metric).value) for s in (first, second))
         ]
-        one, two = (
+        first_mean, second_mean = (
             mean_over_cells(
                 (self._rows[s][i].seed, self._values(s, metric)[i])
                 for cell in common
@@ -224,7 +224,7 @@ class Board:
             )
             for s in (first, second)
         )
-        return one, two, len(common)
+        return first_mean, second_mean, len(common)
 
     def failures(self) -> list[Record]:
         """Return one record of every failed fit."""

@@ -343,19 +343,19 @@ class Results(Sequence[Record]):
         info = metric_info(metric)
         over = select("environment", environments, dict.fromkeys(r.environment for r in self))
         kinds = select("anomaly", anomalies, dict.fromkeys(r.anomaly for r in self))
-        chosen = [r for r in self if r.environment in over and r.anomaly in kinds]
+        records = [r for r in self if r.environment in over and r.anomaly in kinds]
         settings = [
-            self._row(name) for name in rows or dict.fromkeys(str(r.setting) for r in chosen)
+            self._row(name) for name in rows or dict.fromkeys(str(r.setting) for r in records)
         ]
         curves: list[dict[str, list[Point]]] = [
-            {str(s): curve([r for r in chosen if r.setting == s], name) for s in settings}
+            {str(s): curve([r for r in records if r.setting == s], name) for s in settings}
             for name in filter(None, (metric, info.null))
         ]
         if not any(curves[0].values()):
             raise ResultsError(
                 f"no results at several strengths with {metric}: run a split that has some"
             )
-        unit = COSTS.get(Strengths.of(chosen).base, "")
+        unit = COSTS.get(Strengths.of(records).base, "")
         return plots.ladder(curves[0], curves[-1] if info.null else {}, info, unit)
 
     def _row(self, name: str) -> Setting:
@@ -395,7 +395,9 @@ def _scored(
         starts, effects = episodes.onsets.tolist(), episodes.effects.tolist()
     else:
         intervals = episodes.intervals if isinstance(episodes, LabelledSet) else intervals
-        starts = [next((start for start, _ in one[:1] if start >= 0), None) for one in intervals]
+        starts = [
+            next((start for start, _ in spans[:1] if start >= 0), None) for spans in intervals
+        ]
         effects = starts
         reference = data.twins if len(data.twins) else data.train
         rows = np.concatenate([episode.observations for episode in reference])

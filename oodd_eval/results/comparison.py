@@ -211,14 +211,14 @@ def compare(
     common = [c for c in reference.boards if c in now.boards]
     _require_common(now, reference, common)
     # Of a reference in which every cell failed, nothing can be asked but whether they still do.
-    known = reference.metrics() or NAMES
+    metric_names = reference.metrics() or NAMES
     for tolerance in tolerances:
-        if tolerance.metric not in known:
+        if tolerance.metric not in metric_names:
             raise UsageError(
                 f"metric {tolerance.metric!r} is not in {reference.where}, expected one of "
-                f"{', '.join(known)}: write the reference again, or leave the metric out"
+                f"{', '.join(metric_names)}: write the reference again, or leave the metric out"
             )
-    sided = [m for m in NAMES if m in known and worse_side(m) != "±"]
+    sided = [m for m in NAMES if m in metric_names and worse_side(m) != "±"]
     used = list(tolerances) or [Tolerance(m, worse_side(m), 0.0) for m in sided]
     differences: list[Difference] = []
     new: list[Difference] = []
@@ -244,8 +244,8 @@ def compare(
             values = [(t, present[cell].value(t.metric)) for t in used]
             new += [Difference(*_parts(cell), t, NAN, value, "new") for t, value in values]
     new.sort(key=lambda d: (d.split, d.detector, d.scope))
-    for records, others in ((reference, now), (now, reference)):
-        alone = (c for c in records.boards if c not in others.boards)
+    for records, counterpart in ((reference, now), (now, reference)):
+        alone = (c for c in records.boards if c not in counterpart.boards)
         notes += [f"Not compared: {c}, which is only in {records.where}." for c in alone]
     return Comparison([*differences, *new], by, common, notes)
 
@@ -319,9 +319,9 @@ def _compare_metric(
     reference, now = nan_mean(r for r, _ in values), nan_mean(n for _, n in values)
     figure = *unit, tolerance, reference, now
     if turned := [r for r, n in values if math.isnan(r) != math.isnan(n)]:
-        where = "reference" if math.isnan(turned[0]) else "results"
+        undefined_in = "reference" if math.isnan(turned[0]) else "results"
         of = f" in {len(turned)} of {len(both)} cells" if len(both) > 1 else ""
-        return Difference(*figure, "undefined", True, f"no value in the {where}{of}")
+        return Difference(*figure, "undefined", True, f"no value in the {undefined_in}{of}")
     change = 0.0 if math.isnan(reference) else now - reference
     if abs(change) <= RESOLUTION:
         return Difference(*figure, "same")
@@ -362,8 +362,8 @@ def write_reference(
 
     versions, lines = ("oodd_eval", "python", "numpy"), []
     for r in sorted(records, key=order):
-        chosen = {name: m for name, m in r.metrics.items() if name in keep or not keep}
-        metrics = {name: Metric(m.value, n=m.n) for name, m in chosen.items()}
+        kept_metrics = {name: m for name, m in r.metrics.items() if name in keep or not keep}
+        metrics = {name: Metric(m.value, n=m.n) for name, m in kept_metrics.items()}
         terms = {name: r.per_trajectory[name] for name in keep if name in r.per_trajectory}
         kept = replace(
             r,

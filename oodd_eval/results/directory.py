@@ -442,8 +442,8 @@ class FitStore:
             return None
         try:
             packed = read_state(self._file(key))
-            whole = json.loads(packed.text)
-            text, seconds = json.dumps(whole["state"]), float(whole["seconds_fit"])
+            content = json.loads(packed.text)
+            text, seconds = json.dumps(content["state"]), float(content["seconds_fit"])
         except (
             FittedStateError,
             LookupError,

@@ -61,21 +61,21 @@ class Rules:
         `joining` are those of nominal test episodes that join a rolling calibration.
         """
         levels = alarms.offered_levels(len(calibration), alarm)
-        known = Calibration.fit(calibration, alarm)
+        fitted = Calibration.fit(calibration, alarm)
         # A run goes on with a threshold that nothing exceeds, and counts what it misses.
         guaranteed = {
-            suffix: replace(known.unbounded, threshold=known.threshold(level))
+            suffix: replace(fitted.unbounded, threshold=fitted.threshold(level))
             for suffix, level in levels.items()
         }
         paper = AlarmRule(Standardization.fit(calibration))
         if joining is None:
-            return cls(paper, guaranteed, known.unbounded)
+            return cls(paper, guaranteed, fitted.unbounded)
         earlier: dict[str, list[GuaranteedAlarm]] = {}
         for suffix, level in levels.items():
             with contextlib.suppress(UsageError):  # too few for this level
-                earlier[suffix] = alarms.rolling_rules(known, joining, level)
+                earlier[suffix] = alarms.rolling_rules(fitted, joining, level)
         last = {suffix: rules.pop() for suffix, rules in earlier.items()}
-        return cls(paper, last, known.unbounded, earlier)
+        return cls(paper, last, fitted.unbounded, earlier)
 
     def thresholds(self) -> dict[str, Metric]:
         """Return the thresholds of all levels as metrics.

@@ -77,18 +77,18 @@ def _sensors(axis: Any, episode: ScoredEpisode) -> None:
     if episode.twin is not None:
         course = episode.twin.observations
         common, spread = min(len(rows), len(course)), np.maximum(course.std(axis=0), 1e-6)
-        apart, what = np.abs(rows[:common] - course[:common]) / spread, "twin"
+        apart, reference = np.abs(rows[:common] - course[:common]) / spread, "twin"
         rows, course = ((part - course.mean(axis=0)) / spread for part in (rows, course))
     else:
         mean, spread = (0.0, 1.0) if episode.nominal is None else episode.nominal
-        rows, what = (rows - mean) / np.maximum(spread, 1e-6), "nominal"
+        rows, reference = (rows - mean) / np.maximum(spread, 1e-6), "nominal"
         apart = np.abs(rows[anomalous_rows(episode.intervals, len(rows))])
     order = np.argsort(-apart.mean(axis=0), kind="stable")[:SENSORS]
     for colour, d in zip(COLOURS, order, strict=False):
         if episode.twin is not None:
             axis.plot(course[:, d], "--", color=colour, linewidth=0.8, alpha=0.5)
         axis.plot(rows[:, d], color=colour, linewidth=0.8, label=episode.sensors[d])
-    axis.set_ylabel(f"sensor (std. of {what})")
+    axis.set_ylabel(f"sensor (std. of {reference})")
 
 
 def _shade(axis: Any, episode: ScoredEpisode, *, label: bool) -> None:
@@ -98,11 +98,11 @@ def _shade(axis: Any, episode: ScoredEpisode, *, label: bool) -> None:
         return
     names: set[str] = set()
     for start, stop in episode.intervals:
-        known = start >= 0
-        name = "anomalous rows" if known else "anomalous, start unknown"
+        has_start = start >= 0
+        name = "anomalous rows" if has_start else "anomalous, start unknown"
         # Each name stands in the legend once.
         text = name if label and name not in names else None
-        look = {"color": "0.5", "alpha": 0.2, "linewidth": 0, "hatch": None if known else "//"}
+        look = {"color": "0.5", "alpha": 0.2, "linewidth": 0, "hatch": None if has_start else "//"}
         axis.axvspan(max(start, 0), stop, label=text, **look)
         names.add(name)
 
@@ -155,7 +155,7 @@ def ladder(
     empty where strengths are in the units of their kinds of anomalies.
     """
     costs = any(not np.isnan(p.lost) for points in curves.values() for p in points)
-    one = f"strength (1: {unit})" if unit else "strength"
+    strength_label = f"strength (1: {unit})" if unit else "strength"
     figure, grid = _subplots(1, 3.6, columns=1 + costs)
     axes = np.atleast_1d(grid)
     left = axes[0]
@@ -165,11 +165,11 @@ def ladder(
             strength, lost, value = np.array(drawn).reshape(-1, 3).T * ([1], [100], [percent])
             look = {"color": colour, "markersize": 3, "linewidth": 1.2 if label else 0.8}
             for axis, x in zip(axes, (strength, lost), strict=False):
-                known = ~np.isnan(x)
-                axis.plot(x[known], value[known], style, label=label, **look)
+                defined = ~np.isnan(x)
+                axis.plot(x[defined], value[defined], style, label=label, **look)
     left.set_xscale("log")
-    left.set_xlabel(one)
-    axes[-1].set_xlabel("return lost (%)" if costs else one)
+    left.set_xlabel(strength_label)
+    axes[-1].set_xlabel("return lost (%)" if costs else strength_label)
     left.set_ylabel(metric.title + (" (%)" if metric.unit == "percent" else ""))
     if metric.unit == "percent":
         left.set_ylim(0, 102)

@@ -396,14 +396,14 @@ class CompactTerms(Mapping[str, Terms]):
     __slots__ = ("_others", "_position", "_whole")
 
     def __init__(self, names: tuple[str, ...], terms: NDArray[np.float64]) -> None:
-        whole = ((terms >= 0) & (terms <= _MOST_WHOLE) & (terms % 1 == 0)).all(axis=(1, 2))
-        self._position = _positions(names, tuple(whole.tolist()))
-        self._whole, self._others = terms[whole].astype(np.uint16), terms[~whole]
+        is_uint16 = ((terms >= 0) & (terms <= _MOST_WHOLE) & (terms % 1 == 0)).all(axis=(1, 2))
+        self._position = _positions(names, tuple(is_uint16.tolist()))
+        self._whole, self._others = terms[is_uint16].astype(np.uint16), terms[~is_uint16]
 
     def __getitem__(self, name: str) -> Terms:
         """Return numerators and denominators of a metric: float64 of shape (2, n)."""
-        whole, i = self._position[name]
-        terms: Terms = self._whole[i].astype(np.float64) if whole else self._others[i]
+        is_uint16, i = self._position[name]
+        terms: Terms = self._whole[i].astype(np.float64) if is_uint16 else self._others[i]
         return terms
 
     def __iter__(self) -> Iterator[str]:
@@ -419,10 +419,10 @@ _MOST_WHOLE: Final = np.iinfo(np.uint16).max
 
 
 @functools.lru_cache(maxsize=1024)
-def _positions(names: tuple[str, ...], whole: tuple[bool, ...]) -> dict[str, tuple[bool, int]]:
+def _positions(names: tuple[str, ...], is_uint16: tuple[bool, ...]) -> dict[str, tuple[bool, int]]:
     """Return for each metric whether its terms are whole, and its position among its like."""
     counts = {True: itertools.count(), False: itertools.count()}
-    return {name: (flag, next(counts[flag])) for name, flag in zip(names, whole, strict=True)}
+    return {name: (flag, next(counts[flag])) for name, flag in zip(names, is_uint16, strict=True)}
 
 
 def _compact(terms: Mapping[str, Any]) -> Mapping[str, Terms]:

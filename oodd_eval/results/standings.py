@@ -111,10 +111,10 @@ def primary_settings(records: Iterable[Record]) -> set[Setting]:
         cells, few = expected & {r.position for r in by_row[row]}, has_few_seeds(by_row[row])
         return -len(cells), few, len(row.parameters), *_name(row)
 
-    chosen: dict[str, Setting] = {}
+    primary: dict[str, Setting] = {}
     for row in sorted(by_row, key=order):
-        chosen.setdefault(row.detector, row)
-    return set(chosen.values())
+        primary.setdefault(row.detector, row)
+    return set(primary.values())
 
 
 def ranked(
@@ -331,9 +331,9 @@ class PairedComparison:
         ends = sorted((turn * self.low, turn * self.high))
         amount, low, high = map(info.text, (abs(self.difference), *ends))
         unit = {"percent": " points", "steps": " steps"}.get(info.unit, "")
-        where = f"in {info.phrase} {in_words(self.environments)}".rstrip()
+        scope = f"in {info.phrase} {in_words(self.environments)}".rstrip()
         if ends[0] > 0 and self.p <= ALPHA:
-            return f"{rows[0]} beats {rows[1]} by {amount}{unit} [{low}, {high}] {where}."
+            return f"{rows[0]} beats {rows[1]} by {amount}{unit} [{low}, {high}] {scope}."
         if ends[0] > 0:
             why = f"the interval leaves out 0, but p is above {ALPHA:g}"
         elif self.p <= ALPHA:
@@ -341,7 +341,7 @@ class PairedComparison:
         else:
             why = f"the interval holds 0, and p is above {ALPHA:g}"
         return (
-            f"No difference is shown between {rows[0]} and {rows[1]} {where}: "
+            f"No difference is shown between {rows[0]} and {rows[1]} {scope}: "
             f"{amount}{unit} [{low}, {high}], p = {self.p:.2g} ({why})."
         )
 
@@ -428,8 +428,8 @@ def compare_rows(
         for name, row in rows.items()
     }
     tests = {test.first: test for test in rank(shared).comparisons}
-    one, other = shared
-    test = tests[one]
+    first_row, other = shared
+    test = tests[first_row]
     means = (
         nan_mean(nan_mean(c.value for c in cells.values()) for cells in row.values())
         for row in shared.values()
@@ -441,7 +441,7 @@ def compare_rows(
     p = min(t.p_holm for t in tests.values())
     over = in_order((environment for environment, _ in common), ENVIRONMENTS)
     return PairedComparison(
-        one, other, metric, values, sign * test.difference, low, high, p, len(common), over
+        first_row, other, metric, values, sign * test.difference, low, high, p, len(common), over
     )
 
 
@@ -467,12 +467,12 @@ def verdict_of(board: Board, level: str = "") -> str:
     means = {entry: board.mean(entry, *over, board.ranking) for entry in board.entries}
     defined = [entry for entry, mean in means.items() if not math.isnan(mean.value)]
     knowing = {r.setting for r in board.records if r.training != "nominal"}
-    whole = [e for e in defined if not means[e].partial and e not in knowing]
-    rows = sorted(whole if len(whole) > 1 else defined, key=lambda e: -means[e].value)
+    eligible = [e for e in defined if not means[e].partial and e not in knowing]
+    rows = sorted(eligible if len(eligible) > 1 else defined, key=lambda e: -means[e].value)
     if len(rows) > 1:
-        chosen = [r for r in board.records if r.setting in rows[:2] and r.ok]
+        records = [r for r in board.records if r.setting in rows[:2] and r.ok]
         with contextlib.suppress(ResultsError):  # without a cell in common
-            return compare_rows(chosen, str(rows[0]), str(rows[1]), board.ranking).verdict
+            return compare_rows(records, str(rows[0]), str(rows[1]), board.ranking).verdict
     return _in_words(board, (rows or board.entries)[0], level or board.level)
 
 

@@ -68,12 +68,12 @@ class Strengths:
         -------
         Strengths
         """
-        known = {
+        all_rungs = {
             (_pair(r), r.strength): rung for r in records if r.strength and (rung := _rung_of(r))
         }
         rungs: dict[Pair, dict[str, Rung]] = {}
         numbers: dict[str, list[float]] = {}
-        for (pair, name), rung in sorted(known.items(), key=lambda item: item[1].strength):
+        for (pair, name), rung in sorted(all_rungs.items(), key=lambda item: item[1].strength):
             rungs.setdefault(pair, {})[name] = rung
             numbers.setdefault(name, []).append(rung.strength)
         names = sorted(numbers, key=lambda name: (_position(name), float(np.mean(numbers[name]))))
@@ -101,19 +101,19 @@ class Strengths:
         near strengths. The next weaker rung stands in there. A pair without records at a strength
         of that name is left out.
         """
-        chosen = {}
+        strength_names = {}
         for pair, rungs in self.rungs.items():
             ladder = _calibrated(*pair) or rungs
             weaker = [n for n in ladder if _position(n) <= _position(name)]
             counted = weaker[-1] if name in RUNGS and weaker else name
             if counted in rungs:
-                chosen[pair] = counted
-        return chosen
+                strength_names[pair] = counted
+        return strength_names
 
     def at(self, records: Iterable[Record], name: str) -> list[Record]:
         """Return the records in the column of a strength, see `chosen`."""
-        chosen = self.chosen(name)
-        return [r for r in records if r.strength and r.strength == chosen.get(_pair(r))]
+        strength_names = self.chosen(name)
+        return [r for r in records if r.strength and r.strength == strength_names.get(_pair(r))]
 
 
 def _calibrated(environment: str, anomaly: str) -> Mapping[str, Rung]:
@@ -177,8 +177,8 @@ def _threshold(
     strengths = {name: rung.strength for name, rung in rungs.items() if rung.strength > 0}
     seeds = sorted({seed for seed, _ in cells})
     rows = [[cells[seed, n] for n in strengths if (seed, n) in cells] for seed in seeds]
-    whole = strengths and all(len(row) == len(strengths) for row in rows)
-    if not whole or not all(r.ok and DETECTION in r.per_trajectory for row in rows for r in row):
+    complete = strengths and all(len(row) == len(strengths) for row in rows)
+    if not complete or not all(r.ok and DETECTION in r.per_trajectory for row in rows for r in row):
         return None
     terms = np.array([[r.per_trajectory[DETECTION] for r in row] for row in rows])
     threshold = DetectionThreshold.of(
@@ -415,6 +415,6 @@ def _mean(
     strengths: Strengths,
 ) -> MeanThreshold | None:
     """Return the mean over the pairs of a reference, or over all, in units, without one."""
-    chosen = [p for p in by_pair if p in reference] if reference else [*by_pair]
-    units = [reference[p] if reference else strengths.unit(p) for p in chosen]
-    return geometric_mean([by_pair[p] for p in chosen], units) if chosen else None
+    pairs = [p for p in by_pair if p in reference] if reference else [*by_pair]
+    units = [reference[p] if reference else strengths.unit(p) for p in pairs]
+    return geometric_mean([by_pair[p] for p in pairs], units) if pairs else None

@@ -344,8 +344,8 @@ class Tables:
     def _present(self, names: Iterable[str], environments: Sequence[str] = ()) -> list[str]:
         """Return the metrics that any record has a value of, of some environments or of all."""
         records = self.board.records
-        chosen = [r for r in records if not environments or r.environment in environments]
-        return [name for name in names if cells_with(name, chosen)]
+        selected = [r for r in records if not environments or r.environment in environments]
+        return [name for name in names if cells_with(name, selected)]
 
     def columns(self, names: Iterable[str]) -> list[Column]:
         """Return means over all cells, under headings that name no alarm and no level."""
@@ -444,8 +444,8 @@ def lowered_level(board: Board, asked: str, level: str) -> list[str]:
 def unranked(board: Board) -> str:
     """Return a note on the rows that no board ranks, for what they know; empty without one."""
     marks = {str(r.setting): training_mark(r.training) for r in board.records}
-    known = [f"{row} ({mark})" if mark != row else row for row, mark in marks.items() if mark]
-    return f"Not ranked, for what they know: {', '.join(known)}." if known else ""
+    marked_rows = [f"{row} ({mark})" if mark != row else row for row, mark in marks.items() if mark]
+    return f"Not ranked, for what they know: {', '.join(marked_rows)}." if marked_rows else ""
 
 
 def failures(board: Board) -> Table | None:

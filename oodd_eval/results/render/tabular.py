@@ -174,8 +174,8 @@ _NOT_XML: Final = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010f
 
 def junit(comparison: Comparison) -> str:
     """Return JUnit XML: a suite per split and detector, a case per cell (or mean) and metric."""
-    whole = {"name": "oodd-eval compare", **_counts(comparison.differences)}
-    root = ET.Element("testsuites", whole)
+    attributes = {"name": "oodd-eval compare", **_counts(comparison.differences)}
+    root = ET.Element("testsuites", attributes)
     for (split, detector), differences in by_suite(comparison.differences).items():
         name = _clean(f"{split}::{detector}")
         suite = ET.SubElement(root, "testsuite", {"name": name, **_counts(differences)})
