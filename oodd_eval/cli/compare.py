@@ -130,8 +130,8 @@ def compared(
 
 
 def _compare(now: RecordSet, reference: RecordSet, options: Options) -> int:
-    known = dict.fromkeys((*NAMES, *reference.metrics()))
-    tolerances = regression.parse_tolerances(options.fail, known)
+    metric_names = dict.fromkeys((*NAMES, *reference.metrics()))
+    tolerances = regression.parse_tolerances(options.fail, metric_names)
     rules = {"by": options.by, "two_sided": options.two_sided}
     try:
         comparison = regression.compare(now, reference, tolerances, **rules)

@@ -99,15 +99,15 @@ def _splits() -> Rows:
         if name in here:
             manifest = read_manifest(here[name])
             sizes, digest = part_sizes(manifest), manifest["digest"][:12]
-            where = f"{counted(len(manifest['environments']), 'environment(s)')}, digest {digest}"
+            state = f"{counted(len(manifest['environments']), 'environment(s)')}, digest {digest}"
         else:
-            sizes, where = asdict(SPLITS[name]), f"not here: oodd-eval data build {name}"
+            sizes, state = asdict(SPLITS[name]), f"not here: oodd-eval data build {name}"
         text = "{train} train, {calibration} calibration, {test} test seeds"
         further = {"ladder": ", graded", "paper": ", the paper's losses"}
         recipe = SPLITS.get(name)
         noise = f", noise {recipe.noise:.0%}" if recipe and recipe.noise else ""
         suite = further.get(recipe.suite, "") if recipe else ""
-        yield name, text.format_map(sizes) + suite + noise, where
+        yield name, text.format_map(sizes) + suite + noise, state
 
 
 def _metrics() -> Rows:

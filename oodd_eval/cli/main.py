@@ -201,8 +201,8 @@ def _exit_code(arguments: list[str]) -> int:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 2
     except click.UsageError as error:
-        where = f" (see {error.ctx.command_path} --help)" if error.ctx else ""
-        return say(f"{error.format_message().removesuffix('.')}{where}", 4)
+        advice = f" (see {error.ctx.command_path} --help)" if error.ctx else ""
+        return say(f"{error.format_message().removesuffix('.')}{advice}", 4)
     except OoddError as error:
         if "-v" in arguments:
             traceback.print_exc()

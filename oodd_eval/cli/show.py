@@ -78,10 +78,10 @@ def show(options: Options) -> int:
     _check(options, layout)
     results = ResultsDirectory(options.directory)
     records = results.records()
-    known = in_order([*ENVIRONMENTS, *(r.environment for r in records)], ENVIRONMENTS)
-    chosen = select("environment", options.env, known)
+    environments = in_order([*ENVIRONMENTS, *(r.environment for r in records)], ENVIRONMENTS)
+    selected = select("environment", options.env, environments)
     passes = expression(options.expression)
-    records = [r for r in records if r.environment in chosen and passes(str(r.cell))]
+    records = [r for r in records if r.environment in selected and passes(str(r.cell))]
     units: dict[str, str] = {}
     splits: dict[str, Split] = {}
     if not options.stored:

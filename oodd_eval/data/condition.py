@@ -219,8 +219,8 @@ def conditions_of(
     if suite == "table1":
         return {Condition(kind): None for kind in TABLE1}
     if suite == "paper":
-        whole = episode_cap is None and not ENVIRONMENTS[environment].discrete
-        rung = WHOLE if whole else PAPER
+        uncapped_robot = episode_cap is None and not ENVIRONMENTS[environment].discrete
+        rung = WHOLE if uncapped_robot else PAPER
         return {Condition(a, PAPER): strength_of(environment, a, rung) for a in TABLE1}
     kinds = in_order(ladder_of(environment), ANOMALIES)
     if not kinds:

@@ -383,12 +383,12 @@ def _download(address: str, target: Path, most: int) -> None:
         raise SplitError(f"{address} broke off after {got} of {expected} bytes: {again}")
 
 
-def _copy(content: Any, target: Path, most: int, what: str, *, have: int = 0) -> None:
+def _copy(content: Any, target: Path, most: int, name: str, *, have: int = 0) -> None:
     """Write behind the first bytes that `target` has, up to a number of bytes in all."""
     with target.open("ab" if have else "wb") as out:
         while block := content.read(_MIB):
             have += len(block)
             if have > most:
                 target.unlink()
-                raise SplitError(f"{what} has more than the {most} bytes that it may have: refused")
+                raise SplitError(f"{name} has more than the {most} bytes that it may have: refused")
             out.write(block)

@@ -319,8 +319,8 @@ def _problem_of(spec: Spec) -> str:
     """Return what is wrong with a task, or with the rows of a kind; empty if nothing is."""
     if isinstance(spec, EnvironmentSpec):
         tasks = get_args(Task)
-        known = spec.task in tasks
-        return "" if known else f"task {spec.task!r}, expected one of {', '.join(tasks)}"
+        is_task = spec.task in tasks
+        return "" if is_task else f"task {spec.task!r}, expected one of {', '.join(tasks)}"
     pulses = (1, 1) if spec.pulses is None else tuple(spec.pulses)
     if min(spec.ramp, spec.lasts) < 0:
         return f"ramp {spec.ramp} and lasts {spec.lasts}, expected numbers of rows from 0"

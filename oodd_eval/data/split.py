@@ -138,15 +138,15 @@ def load_split(name: str | Path) -> "Split":
         return Split(path)
     if isinstance(name, Path) or os.sep in name:
         raise SplitNotFoundError(f"{name} is no split: it has no {MANIFEST}")
-    known = split_directories()
-    if name in known:
-        return Split(known[name])
+    directories = split_directories()
+    if name in directories:
+        return Split(directories[name])
     if name in SPLITS:
         raise SplitNotFoundError(
             f"split {name!r} is not on this machine: build it with "
             f"`oodd-eval data build {name}`, or fetch a copy with `oodd-eval data fetch`"
         )
-    raise UnknownNameError("split", name, {*known, *SPLITS})
+    raise UnknownNameError("split", name, {*directories, *SPLITS})
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,7 +263,7 @@ class Split:
             When something is unknown, or the environments have nominal episodes only.
         """
         try:
-            chosen = select("environment", environments, self.environments)
+            selected = select("environment", environments, self.environments)
         except UnknownNameError as error:
             if not (holders := splits_with(error.name)):
                 raise
@@ -271,12 +271,12 @@ class Split:
                 f"split {self.name} has no environment {error.name!r}: it is in split "
                 f"{' and '.join(holders)}, pass --split {holders[0]}"
             ) from None
-        if not (known := self._names(*chosen)):
+        if not (anomaly_names := self._names(*selected)):
             raise UsageError(
-                f"split {self.name} has no anomalous episodes of {', '.join(chosen)}, expected "
+                f"split {self.name} has no anomalous episodes of {', '.join(selected)}, expected "
                 "some to evaluate detectors on: import them, or fit a watchdog on what there is"
             )
-        return chosen, select("anomaly", anomalies, known)
+        return selected, select("anomaly", anomalies, anomaly_names)
 
     def _names(self, *environments: str) -> tuple[str, ...]:
         conditions = in_suite_order(c for e in environments for c in self.conditions(e))

@@ -179,8 +179,8 @@ class StoredFile:
             raise self.bounds.error(message)
         if name in lazy or (lazy and dataset.dtype.hasobject):
             return StoredRows(self, dataset)
-        what = f"{self.name}, {dataset.name}"
-        self._taken = self.bounds.check(what, dataset.dtype, dataset.nbytes, self._taken)
+        array_name = f"{self.name}, {dataset.name}"
+        self._taken = self.bounds.check(array_name, dataset.dtype, dataset.nbytes, self._taken)
         array: NDArray[Any] = np.asarray(dataset[()])
         array.flags.writeable = False
         return array

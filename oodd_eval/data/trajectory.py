@@ -117,21 +117,21 @@ class TrajectorySequence(Sequence[Trajectory]):
     def _one(self, i: int) -> Trajectory: ...
 
 
-def _matrix(what: str, values: ArrayLike) -> NDArray[np.float32]:
+def _matrix(name: str, values: ArrayLike) -> NDArray[np.float32]:
     try:
         array = np.array(values, dtype=np.float32, order="C", ndmin=1)
     except (TypeError, ValueError) as error:
-        raise TrajectoryError(f"{what} cannot be read as a float32 matrix: {error}") from None
-    if array.ndim != 2 or (what == "observations" and 0 in array.shape):
+        raise TrajectoryError(f"{name} cannot be read as a float32 matrix: {error}") from None
+    if array.ndim != 2 or (name == "observations" and 0 in array.shape):
         raise TrajectoryError(
-            f"{what} have shape {array.shape}, expected (rows, columns)"
-            + (" with at least one row and one column" if what == "observations" else "")
+            f"{name} have shape {array.shape}, expected (rows, columns)"
+            + (" with at least one row and one column" if name == "observations" else "")
         )
     bad = ~np.isfinite(array)
     if bad.any():
         row, column = (int(i) for i in np.argwhere(bad)[0])
         raise TrajectoryError(
-            f"{what} hold {int(bad.sum())} values that are not finite, the first at row {row}, "
+            f"{name} hold {int(bad.sum())} values that are not finite, the first at row {row}, "
             f"column {column}: {array[row, column]}; a trajectory has finite values only"
         )
     array.flags.writeable = False

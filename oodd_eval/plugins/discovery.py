@@ -87,8 +87,8 @@ class Offer:
         missing = [name for name in self.spec.requires if not _importable(name)]
         if not missing:
             return ""
-        what = f'"{self.spec.extra}"' if self.spec.extra else " ".join(missing)
-        return f"needs {', '.join(missing)}: pip install {what}"
+        requirements = f'"{self.spec.extra}"' if self.spec.extra else " ".join(missing)
+        return f"needs {', '.join(missing)}: pip install {requirements}"
 
     def require(self) -> None:
         """Raise `MissingExtraError` when it cannot run here."""
@@ -148,8 +148,8 @@ class Plugin:
         makers = self.hook.oodd_detector_from_spec.get_hookimpls()
         if not makers:
             return ""
-        known = inspect.getdoc(makers[0].function) or "names with a colon"
-        return printable(known.partition("\n")[0].removesuffix("."))
+        description = inspect.getdoc(makers[0].function) or "names with a colon"
+        return printable(description.partition("\n")[0].removesuffix("."))
 
     def from_spec(self, text: str) -> DetectorSpec | None:
         """Return the detector for a `maker:name` text, or None if it does not know the maker."""
@@ -271,8 +271,8 @@ class Plugins:
         parts = [part.strip() for part in patterns.split(",")]
         several = [p for p in parts if p == "all" or (":" not in p and set(p) & set("*?["))]
         exact = {p: self.offer(p).spec.name for p in parts if p and p not in several}
-        known = self.offers if several else self._offers
-        return select("detector", ",".join(exact.get(part, part) for part in parts), known)
+        offers = self.offers if several else self._offers
+        return select("detector", ",".join(exact.get(part, part) for part in parts), offers)
 
     def spec_forms(self) -> list[tuple[str, str, str]]:
         """Return who makes detectors of names with a colon: plug-in, origin, and which names."""
@@ -367,12 +367,12 @@ class Plugins:
                 return _offer(maker.point, spec)
             if spec:
                 expected = "None or a DetectorSpec whose name has a colon"
-                what = f"made {spec.name!r} of {text!r}, expected {expected}"
-                raise PluginError(f"{name_of(maker.point)} {what}")
+                reason = f"made {spec.name!r} of {text!r}, expected {expected}"
+                raise PluginError(f"{name_of(maker.point)} {reason}")
             asked.append(maker.point.name)
         whom = f"asked {', '.join(asked)}" if asked else "none that is loaded knows such names"
-        where = "oodd-eval list detectors says which names there are"
-        raise UsageError(f"no plug-in makes a detector of {text!r}: {whom} ({where})")
+        advice = "oodd-eval list detectors says which names there are"
+        raise UsageError(f"no plug-in makes a detector of {text!r}: {whom} ({advice})")
 
 
 def discover(
@@ -401,9 +401,9 @@ def discover(
 
     plugins = Plugins([*filter(selected, points)], [*filter(selected, observers)], load)
     plugins.broken += [Broken("unknown", b.distribution, b.reason) for b in broken if b.is_ours]
-    if others := [b for b in broken if not b.is_ours]:
-        more = f", and {len(others) - 1} more" if others[1:] else ""
-        plugins.notes.append(f"passed over {others[0].distribution}{more}: {others[0].reason}")
+    if not_ours := [b for b in broken if not b.is_ours]:
+        more = f", and {len(not_ours) - 1} more" if not_ours[1:] else ""
+        plugins.notes.append(f"passed over {not_ours[0].distribution}{more}: {not_ours[0].reason}")
     return plugins
 
 
@@ -437,8 +437,8 @@ def register(plugin: object, *specifications: ModuleType) -> pluggy.HookRelay:
     for specification in (hooks, *specifications):
         manager.add_hookspecs(specification)
     manager.register(plugin)
-    known = {*hooks.OFFER_HOOKS, *hooks.OBSERVER_HOOKS}
-    check_known("hook", known, *(caller.name for caller in manager.get_hookcallers(plugin) or ()))
+    names = {*hooks.OFFER_HOOKS, *hooks.OBSERVER_HOOKS}
+    check_known("hook", names, *(caller.name for caller in manager.get_hookcallers(plugin) or ()))
     return manager.hook
 
 

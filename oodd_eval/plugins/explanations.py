@@ -79,7 +79,7 @@ def explains(detector: object) -> bool:
 
 def explain_chunk(detector: Any, chunk: Sequence[Trajectory]) -> list[object]:
     """Return what is kept of a detector's explanations, after they were checked."""
-    checked = (checked_explanation(detector.explain(one), one) for one in chunk)
+    checked = (checked_explanation(detector.explain(episode), episode) for episode in chunk)
     # Of several with the largest share the first one is named.
     return [
         np.array([np.where(o < 0, -1, np.nan_to_num(s).argmax(axis=1)), o], dtype=np.int32)
@@ -105,13 +105,13 @@ def checked_explanation(returned: Any, trajectory: Trajectory) -> Explanation:
             raise ContractError(f"explain returned {name} as {actual}, expected {form}")
     undefined = np.isnan(shares).all(axis=1)
     parts = (shares >= 0).all(axis=1) & (np.abs(shares.sum(axis=1) - 1) <= _ROUNDING)
-    known = (onsets >= 0) & (onsets <= np.arange(rows))
+    valid = (onsets >= 0) & (onsets <= np.arange(rows))
     for name, array, fine, expected in (
         ("shares", shares, undefined | parts, "parts of 1, or NaN alone where it is undefined"),
         (
             "onset",
             onsets,
-            np.where(undefined, onsets == -1, known),
+            np.where(undefined, onsets == -1, valid),
             "a row from 0 to t, or -1 where the shares are NaN",
         ),
     ):
@@ -126,8 +126,8 @@ def check_named(array: object, scores: Scores, sensors: int, where: str) -> Name
     rows = len(scores)
     if not isinstance(array, np.ndarray) or array.dtype != np.int32 or array.shape != (2, rows):
         raise ContractError(f"no explanation came back for {where}")
-    known = ((array >= 0) & (array <= [np.full(rows, sensors - 1), np.arange(rows)])).all(axis=0)
-    fine = np.where(np.isnan(scores), (array == -1).all(axis=0), known)
+    valid = ((array >= 0) & (array <= [np.full(rows, sensors - 1), np.arange(rows)])).all(axis=0)
+    fine = np.where(np.isnan(scores), (array == -1).all(axis=0), valid)
     if not fine.all():
         t = int(fine.argmin())
         raise ContractError(

@@ -72,11 +72,11 @@ class FeatureScale:
     def must_fit(self, trajectory: Trajectory) -> None:
         """Raise `TrajectoryError` when the trajectory has another number of sensors."""
         if (sensors := trajectory.observation_dim) != len(self.mean):
-            what = (
+            mismatch = (
                 f"fitted on {len(self.mean)} sensors and asked to score a trajectory of {sensors}"
             )
             advice = "score trajectories of the environment that the detector was fitted on"
-            raise TrajectoryError(f"{what}: {advice}")
+            raise TrajectoryError(f"{mismatch}: {advice}")
 
     def row(self, observation: ArrayLike) -> NDArray[np.float32]:
         """Return one standardized observation, float32 of shape (D,); raises as `checked` does."""

@@ -65,11 +65,11 @@ def named(distribution: Distribution | None) -> tuple[str, str]:
 
 def _broken(distribution: Distribution | None, error: Exception) -> BrokenMetadata:
     """Return a broken distribution; its directory is named, as its metadata cannot be trusted."""
-    where = str(getattr(distribution, "_path", "unknown distribution"))
+    directory = str(getattr(distribution, "_path", "unknown distribution"))
     reason = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
     reason = f"its metadata cannot be read, reinstall or remove it: {reason}"
     try:
-        is_ours = b"oodd_eval" in (Path(where) / "entry_points.txt").read_bytes()
+        is_ours = b"oodd_eval" in (Path(directory) / "entry_points.txt").read_bytes()
     except OSError:
         is_ours = False
-    return BrokenMetadata(where, reason, is_ours)
+    return BrokenMetadata(directory, reason, is_ours)

@@ -73,7 +73,7 @@ class ParameterInfo:
             return self._wrong(value, self.types)
         if self.items and not value:
             return "expected at least one value"
-        wrong = (self._wrong(one, self.items) for one in value if self.items)
+        wrong = (self._wrong(item, self.items) for item in value if self.items)
         return next(filter(None, wrong), "")
 
     def _wrong(self, value: Any, expected: tuple[type, ...]) -> str:
@@ -139,13 +139,13 @@ def resolve_parameters(
 
     Raises `UsageError` for a wrong value, or a name not declared, unless it takes `others`.
     """
-    known = parameters_of(declared)
+    parameters = parameters_of(declared)
     for name, value in values.items():
-        if name not in known and not others:
-            raise UnknownNameError(f"parameter of {detector}", name, known)
-        if name in known and (problem := known[name].problem(value)):
+        if name not in parameters and not others:
+            raise UnknownNameError(f"parameter of {detector}", name, parameters)
+        if name in parameters and (problem := parameters[name].problem(value)):
             raise UsageError(f"parameter {name!r} of {detector} is {value!r}, {problem}")
-    return dict(sorted({**{n: p.default for n, p in known.items()}, **values}.items()))
+    return dict(sorted({**{n: p.default for n, p in parameters.items()}, **values}.items()))
 
 
 def parameters_by_detector(

@@ -98,9 +98,9 @@ def _plain(name: str, value: Any, depth: int = 0) -> Any:
         return value
     if depth < _DEEPEST:
         if kind in (list, tuple) and len(value) <= _LONGEST_TEXT:
-            return [_plain(name, one, depth + 1) for one in value]
+            return [_plain(name, nested, depth + 1) for nested in value]
         if kind is dict and all(type(key) is str for key in value):
-            return {key: _plain(name, one, depth + 1) for key, one in value.items()}
+            return {key: _plain(name, nested, depth + 1) for key, nested in value.items()}
     raise PluginError(f"parameter {name!r:.80} has {value!r:.80}, expected a value that JSON knows")
 
 

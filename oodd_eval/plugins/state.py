@@ -262,10 +262,10 @@ def take(
         or not np.isfinite(array).all()
         or (kind == "+" and not (array > 0).all())
     ):
-        what = "nothing" if array is None else f"{type(array).__name__} {np.shape(array)}"
+        actual = "nothing" if array is None else f"{type(array).__name__} {np.shape(array)}"
         numbers = {"f": "finite floats", "+": "positive finite floats", "i": "integers"}[kind]
         raise FittedStateError(
-            f"array {name!r} of the state is {what}, expected {numbers} of shape {shape} "
+            f"array {name!r} of the state is {actual}, expected {numbers} of shape {shape} "
             "(None: any)"
         )
     return array

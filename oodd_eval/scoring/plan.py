@@ -156,10 +156,10 @@ def make_plan(
     if device is not None:
         _set_device(device, offers, values)
     units = tuple(
-        make_unit(offer, chosen, split, environment, conditions, horizon, seed, limit, rolling)
+        make_unit(offer, arguments, split, environment, conditions, horizon, seed, limit, rolling)
         for environment in environments
         if (conditions := _chosen(split.conditions(environment), anomalies))
-        for offer, chosen in zip(offers, values, strict=True)
+        for offer, arguments in zip(offers, values, strict=True)
         for horizon in horizons
         for seed in seeds
     )
@@ -211,16 +211,16 @@ def _set_device(device: str, offers: Sequence[Offer], values: Sequence[dict[str,
         raise UsageError(f"--device {device}: none of the detectors has a device ({names})")
     if having and device not in DEVICES:
         raise UsageError(f"--device is {device!r}, expected one of {', '.join(DEVICES)}")
-    for chosen in having:
-        chosen["device"] = device
+    for arguments in having:
+        arguments["device"] = device
 
 
 def _chosen(conditions: Sequence[Condition], names: Sequence[str] | None) -> tuple[Condition, ...]:
     """Return the conditions that some names choose, in the order of the names."""
     if names is None:
         return tuple(conditions)
-    chosen = (c for name in names for c in conditions if name in (str(c), c.anomaly))
-    return tuple(dict.fromkeys(chosen))
+    selected = (c for name in names for c in conditions if name in (str(c), c.anomaly))
+    return tuple(dict.fromkeys(selected))
 
 
 def make_unit(

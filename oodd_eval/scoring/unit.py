@@ -219,7 +219,7 @@ class GroupedScoring:
             groups: Iterable[list[Member]], work: Callable[..., list[object]]
         ) -> list[object]:
             chunks = ([*self._members(group)] for group in groups)
-            return [one for chunk in chunks for one in work(self._another(detector), chunk)]
+            return [result for chunk in chunks for result in work(self._another(detector), chunk)]
 
         scores = returned(self._groups, contract.score_chunk)
         again = self._explained if explanations.explains(detector) else ()
@@ -266,11 +266,11 @@ class GroupedScoring:
         # Of a detector that adapts these rows were scored, too.
         start = rows if self._adapts else 0
         parts = {
-            part: [np.concatenate([np.full(rows, np.nan), one[start:]]) for one in arrays]
+            part: [np.concatenate([np.full(rows, np.nan), array[start:]]) for array in arrays]
             for part, arrays in scores.parts.items()
         }
         explained = {
-            part: [_behind(one[:, start:], rows, rows - start) for one in arrays]
+            part: [_behind(array[:, start:], rows, rows - start) for array in arrays]
             for part, arrays in scores.explained.items()
         }
         return replace(scores, parts=parts, explained=explained)
@@ -308,9 +308,9 @@ class GroupedScoring:
         again = self._explained if explained else ()
         named: dict[str, list[Named]] = {group[0].part: [] for group in again}
         for (part, i), array in zip(chain(*again), explained, strict=True):
-            where = f"{unit.environment}/{part}[{i}]"
+            label = f"{unit.environment}/{part}[{i}]"
             sensors = len(self._job.data.sensors)
-            named[part].append(explanations.check_named(array, parts[part][i], sensors, where))
+            named[part].append(explanations.check_named(array, parts[part][i], sensors, label))
         return self._whole(ScoreFile(parts, {}, named))
 
 
@@ -343,8 +343,8 @@ class _Visible(TrajectorySequence):
 def _behind(explained: Named, rows: int, shift: int) -> Named:
     """Return an explanation behind undefined rows; what it calls onsets are `shift` rows later."""
     onsets = np.where(explained[1] < 0, -1, explained[1] + shift)
-    known = np.stack([explained[0], onsets])
-    return np.concatenate([np.full((2, rows), -1), known], axis=1).astype(np.int32)
+    shifted = np.stack([explained[0], onsets])
+    return np.concatenate([np.full((2, rows), -1), shifted], axis=1).astype(np.int32)
 
 
 def groups(sizes: Mapping[str, int]) -> list[list[Member]]:

@@ -218,7 +218,7 @@ class Child:
     def death(self) -> str:
         """Say how it ended, after `end`."""
         if self.returncode < 0:
-            names = {one.value: one.name for one in signal.Signals}  # not of all there are
+            names = {member.value: member.name for member in signal.Signals}  # not of all there are
             return f"was killed by {names.get(-self.returncode, f'signal {-self.returncode}')}"
         return f"ended with exit code {self.returncode}"
 

@@ -90,10 +90,10 @@ def check_executor(name: str) -> None:
         return
     try:
         address = urlsplit(name)
-        whole = address.scheme == "dask" and address.hostname and address.port
+        complete = address.scheme == "dask" and address.hostname and address.port
     except ValueError:
-        whole = False
-    if not whole or address.path or address.query or address.fragment:
+        complete = False
+    if not complete or address.path or address.query or address.fragment:
         raise UsageError(
             f"--executor {name!r}, expected 'local' or 'dask://HOST:PORT', the address of a Dask "
             "scheduler"

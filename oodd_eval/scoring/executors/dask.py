@@ -95,9 +95,9 @@ class DaskExecutor(Executor):
         except Exception as error:
             if self._stopping.is_set():
                 return Scored("error", "interrupted")
-            where = f"{job.unit.setting.label(job.unit.seed)} on {job.unit.environment}"
+            unit_label = f"{job.unit.setting.label(job.unit.seed)} on {job.unit.environment}"
             raise ExecutorError(
-                f"{where} could not be run on the cluster at {self._address} "
+                f"{unit_label} could not be run on the cluster at {self._address} "
                 f"({type(error).__name__}: {error}); its workers need oodd-eval and the same "
                 "plug-ins as this side"
             ) from error
