@@ -81,9 +81,9 @@ class Cells:
 
     def pytest_report_header(self) -> str:
         """Return a line on what is checked, and against what."""
-        where = f"against {self.reference.where}" if self.reference else "without a reference"
+        reference = f"against {self.reference.where}" if self.reference else "without a reference"
         cells = counted(len(self.names), "cell(s)")
-        return f"oodd-eval: {cells} in {counted(len(self.plan.units), 'fit(s)')}, {where}"
+        return f"oodd-eval: {cells} in {counted(len(self.plan.units), 'fit(s)')}, {reference}"
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_collection_modifyitems(self, session: pytest.Session, items: list[Any]) -> None:
@@ -180,12 +180,12 @@ def _comparable(
     """Return the reference cells whose split digest matches, of detectors at their defaults."""
     conditions = Conditions(split.name, split.digest, PROTOCOL, None)
     records = list(reference.boards.get(conditions, {}).values())
-    chosen = [r for r in records if r.detector in detectors and r.environment in environments]
-    if plain := [r for r in chosen if not r.overrides]:
+    selected = [r for r in records if r.detector in detectors and r.environment in environments]
+    if plain := [r for r in selected if not r.overrides]:
         return RecordSet.of(plain, reference.where)
     has = "; ".join(map(str, reference.boards)) or "no cells"
     if records:
-        has = f"only others, such as {(chosen or records)[0].cell}"
+        has = f"only others, such as {(selected or records)[0].cell}"
     raise UsageError(
         f"nothing in common: {reference.where} has {has}, expected cells of {conditions}, of "
         f"{', '.join(detectors)} with default parameters in {', '.join(environments)}: name "
@@ -215,11 +215,11 @@ def _plan(
     return plan.matching(selected.__contains__)
 
 
-def _explained(record: Record, failures: list[Difference], where: str) -> str:
+def _explained(record: Record, failures: list[Difference], reference: str) -> str:
     reason = "\n".join(map(message, failures)) if record.ok else f"{record.status}: {record.reason}"
     command = (
         f"oodd-eval run --detector {record.detector} --env {record.environment} "
         f"--anomaly {record.condition} --split {record.split} --horizon {record.horizon} "
         f"--seed {record.seed}"
     )
-    return f"{reason}\nthe reference is {where}; to run this cell alone:\n{command}"
+    return f"{reason}\nthe reference is {reference}; to run this cell alone:\n{command}"

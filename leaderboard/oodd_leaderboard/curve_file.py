@@ -85,29 +85,29 @@ def check_curves(plain: Any, where: str) -> dict[str, Any]:
     for i, unit in enumerate(plain["units"]):
         unpaired = isinstance(unit, dict) and unit.get("paired") is False
         _hold_to(of_logs if unpaired else of_twins, unit, where, f"units[{i}]")
-    whole: dict[str, Any] = plain
-    if whole["schema"] != SCHEMA:
+    content: dict[str, Any] = plain
+    if content["schema"] != SCHEMA:
         problem = f"expected {SCHEMA}: it was written by another version of oodd-eval"
-        raise _wrong(f"{where}: schema", whole["schema"], problem)
+        raise _wrong(f"{where}: schema", content["schema"], problem)
     seen: set[str] = set()
-    for i, unit in enumerate(whole["units"]):
+    for i, unit in enumerate(content["units"]):
         name = f"{where}: units[{i}]"
         if unit["cell"] in seen:
             raise _wrong(f"{name}.cell", unit["cell"], "a cell that occurs before")
         seen.add(unit["cell"])
         for part in ("roc", "delay_far"):
-            (first_name, first), *others = unit[part].items()
-            for other, values in others:
+            (first_name, first), *other_columns = unit[part].items()
+            for other, values in other_columns:
                 _check_length(values, first, f"{name}.{part}.{other}")
             for k, (before, value) in enumerate(itertools.pairwise(first), start=1):
                 if value < before:
                     field = f"{name}.{part}.{first_name}[{k}]"
                     raise _wrong(field, value, f"below {before} before it")
         _check_example(unit["example"], f"{name}.example")
-    return whole
+    return content
 
 
-def _hold_to(layout: TypeAdapter[Any], plain: Any, where: str, at: str = "") -> None:
+def _hold_to(layout: TypeAdapter[Any], plain: Any, file: str, at: str = "") -> None:
     """Raise `ResultsError` for the first field of a value that is not as a layout has it."""
     try:
         layout.validate_python(plain)
@@ -117,7 +117,7 @@ def _hold_to(layout: TypeAdapter[Any], plain: Any, where: str, at: str = "") -> 
         path = at + "".join(
             f"[{p}]" if isinstance(p, int) else f".{ascii(p)[1:-1]:.60}" for p in first["loc"]
         )
-        raise _wrong(f"{where}: {path.removeprefix('.')}", first["input"], first["msg"]) from None
+        raise _wrong(f"{file}: {path.removeprefix('.')}", first["input"], first["msg"]) from None
 
 
 def strict_model(**types: Any) -> Any:
@@ -174,36 +174,36 @@ def _layouts() -> tuple[TypeAdapter[Any], TypeAdapter[Any], TypeAdapter[Any]]:
     return TypeAdapter(layout), TypeAdapter(unit), TypeAdapter(unpaired)
 
 
-def _check_example(example: Mapping[str, Any], where: str) -> None:
+def _check_example(example: Mapping[str, Any], name: str) -> None:
     """Check how the numbers of an example fit one another; one without a twin has intervals."""
     start, length = example["start"], example["length"]
     if (onset := example.get("onset", start)) >= length:
-        raise _wrong(f"{where}.onset", onset, f"expected less than length, {length}")
+        raise _wrong(f"{name}.onset", onset, f"expected less than length, {length}")
     if start > onset:
-        raise _wrong(f"{where}.start", start, f"expected at most onset, {onset}")
+        raise _wrong(f"{name}.start", start, f"expected at most onset, {onset}")
     for prefix, scores in (("", "scores"), ("twin_", "twin")):
         if scores not in example:
             continue
         rows = range(start, start + len(example[f"{prefix}cusum"]))
-        _check_length(example[scores], rows, f"{where}.{scores}")
+        _check_length(example[scores], rows, f"{name}.{scores}")
         for i, row in enumerate(example[f"{prefix}alarms"]):
             if row not in rows:
                 problem = f"no row in {start} ... {rows.stop - 1}"
-                raise _wrong(f"{where}.{prefix}alarms[{i}]", row, problem)
+                raise _wrong(f"{name}.{prefix}alarms[{i}]", row, problem)
     if len(example["scores"]) > length - start:
         actual = f"{len(example['scores'])} numbers"
         problem = f"expected at most length - start, {length - start}"
-        raise _wrong(f"{where}.scores", actual, problem)
+        raise _wrong(f"{name}.scores", actual, problem)
     for i, (first, stop) in enumerate(example.get("intervals", ())):
         if not first < stop <= length:
             problem = f"expected a first row before the end, of at most {length}"
-            raise _wrong(f"{where}.intervals[{i}]", [first, stop], problem)
+            raise _wrong(f"{name}.intervals[{i}]", [first, stop], problem)
 
 
-def _check_length(values: Sequence[Any], like: Sequence[Any], where: str) -> None:
+def _check_length(values: Sequence[Any], like: Sequence[Any], field: str) -> None:
     if len(values) != len(like):
-        raise _wrong(where, f"{len(values)} numbers", f"expected {len(like)}")
+        raise _wrong(field, f"{len(values)} numbers", f"expected {len(like)}")
 
 
-def _wrong(where: str, value: Any, problem: str) -> ResultsError:
-    return ResultsError(f"{where} is {value!r:.80}: {problem}")
+def _wrong(field: str, value: Any, problem: str) -> ResultsError:
+    return ResultsError(f"{field} is {value!r:.80}: {problem}")

@@ -113,8 +113,8 @@ def delay_far(
     names = ("threshold", "far", "delay_censored", "missed", *["null_censored"] * paired)
     rows = []
     steps = sum(int(np.count_nonzero(~np.isnan(b))) for b in sweep.twins)
-    known = steps and len(anomalous)
-    for rule, quiet in zip(sweep.rules, sweep.quiet, strict=True) if known else ():
+    defined = steps and len(anomalous)
+    for rule, quiet in zip(sweep.rules, sweep.quiet, strict=True) if defined else ():
         loud = [rule.alarms(a) for a in anomalous]
         missed = [math.isnan(first_delay(x, t)) for x, t in zip(loud, onsets, strict=True)]
         far = sum(int(alarms.sum()) for alarms in quiet) / steps
@@ -209,9 +209,9 @@ def cell_curves(
     else:
         areas, tpr = pooled_roc(cell)
         starts = {i: cell.intervals[i][0][0] for i in cell.labelled}
-        known = {i: start for i, start in starts.items() if 0 <= start < len(cell.anomalous[i])}
-        episodes = [cell.anomalous[i] for i in known]
-        delays = delay_far(sweep, episodes, [*known.values()], paired=False)
+        onsets = {i: start for i, start in starts.items() if 0 <= start < len(cell.anomalous[i])}
+        episodes = [cell.anomalous[i] for i in onsets]
+        delays = delay_far(sweep, episodes, [*onsets.values()], paired=False)
         drawn = _unpaired_example(cell, areas, rule)
     defined = not np.isnan(tpr).any()
     roc_curve = {"fpr": list(FPR) if defined else [], "tpr": tpr.tolist() if defined else []}
@@ -261,11 +261,11 @@ def _shares_above(
     for line, reference in zip(table, references, strict=True):
         line[: len(reference)] = reference[: len(scores)]
     counts = (~np.isnan(table)).sum(axis=0)
-    chosen = rows & (counts >= LEAST_NOMINAL)
-    table, counts = table[:, chosen], counts[chosen]
+    comparable = rows & (counts >= LEAST_NOMINAL)
+    table, counts = table[:, comparable], counts[comparable]
     return (
-        (table > scores[chosen]).sum(axis=0) / counts,
-        (table == scores[chosen]).sum(axis=0) / counts,
+        (table > scores[comparable]).sum(axis=0) / counts,
+        (table == scores[comparable]).sum(axis=0) / counts,
     )
 
 

@@ -112,8 +112,8 @@ def commands_of(records: Sequence[Record]) -> list[str]:
         anomalies.add(str(record.condition))
     alike: dict[tuple[str, ...], list[str]] = {}
     for setting, (environments, seeds, anomalies) in sorted(rows.items(), key=_in_order):
-        whole = environments == set(ENVIRONMENTS)
-        options = ["--env", "all" if whole else ",".join(sorted(environments))]
+        all_environments = environments == set(ENVIRONMENTS)
+        options = ["--env", "all" if all_environments else ",".join(sorted(environments))]
         if anomalies != set(TABLE1):
             options += ["--anomaly", ",".join(sorted(anomalies))]
         options += ["--split", records[0].split.partition("@")[0]]
@@ -229,10 +229,10 @@ class LeaderboardSection:
         """Order of the boards, see `sections`."""
         board = self.ranks.board
         name = board.split.partition("@")[0]
-        known = _SPLITS_FIRST.index(name) if name in _SPLITS_FIRST else len(_SPLITS_FIRST)
+        position = _SPLITS_FIRST.index(name) if name in _SPLITS_FIRST else len(_SPLITS_FIRST)
         # Whole splits before limited ones, the newest protocol first.
         limit = -1 if board.limit is None else int(board.limit)
-        return known, name, limit, -board.protocol, board.digest
+        return position, name, limit, -board.protocol, board.digest
 
 
 @dataclass(frozen=True, slots=True)

@@ -121,7 +121,7 @@ def differences(fresh: Path, existing: Path) -> list[str]:
     new, old = _files(fresh), _files(existing)
     changed = {n for n in new & old if _content(fresh / n) != _content(existing / n)}
     parts = ((new - old, "missing"), (old - new, STALE), (changed, "differs"))
-    return sorted(f"{name}: {what}" for names, what in parts for name in names)
+    return sorted(f"{name}: {difference}" for names, difference in parts for name in names)
 
 
 def stale(output: Path, written: Collection[str]) -> list[str]:

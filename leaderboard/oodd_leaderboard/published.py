@@ -169,9 +169,9 @@ def board_of(records: Sequence[Record], among: Iterable[PublishedBoard]) -> Publ
     if conditions in by_conditions:
         return by_conditions[conditions]
     listed = "; ".join(map(str, by_conditions)) or "none"
-    if any(known.split_digest == conditions.split_digest for known in by_conditions):
+    if any(candidate.split_digest == conditions.split_digest for candidate in by_conditions):
         advice = "run again with this version, without --limit, into another directory"
-    elif not conditions.paired and all(known.paired for known in by_conditions):
+    elif not conditions.paired and all(candidate.paired for candidate in by_conditions):
         advice = (
             "logs of your own have no board there: `oodd-eval compare` tells which of your rows is "
             "better"
@@ -179,7 +179,7 @@ def board_of(records: Sequence[Record], among: Iterable[PublishedBoard]) -> Publ
     else:
         name = conditions.split.partition("@")[0]
         advice = "run on a published split, such as --split mini"
-        if any(known.split == name for known in by_conditions):
+        if any(candidate.split == name for candidate in by_conditions):
             advice += f"; a split {name} that was built otherwise is another one"
     raise UsageError(
         f"these results cannot be compared with the board: they are of {conditions}, and "
@@ -254,10 +254,12 @@ def placement(
     first = board.primary - replaced
     taken = {row.detector for row in first}
     free = [r for rows in new.values() for r in rows if r.setting.detector not in taken]
-    chosen = {row.detector: row for row in primary_settings(free)}
-    chosen |= {row.detector: row for row in new if str(row) in primary and row.detector in chosen}
+    primary_rows = {row.detector: row for row in primary_settings(free)}
+    primary_rows |= {
+        row.detector: row for row in new if str(row) in primary and row.detector in primary_rows
+    }
     # With too few seeds a primary row has no rank. A variant has the one that it would have.
-    first = first | {row for row in chosen.values() if not has_few_seeds(new[row])}
+    first = first | {row for row in primary_rows.values() if not has_few_seeds(new[row])}
     used = [r for rows in (on_board | new).values() for r in rows if r.position in cells]
     lacking = {row: _lacking(rows, expected) for row, rows in new.items()}
     return Placement(
@@ -271,12 +273,12 @@ def placement(
     )
 
 
-def _within(records: Sequence[Record], others: Sequence[Record]) -> bool:
+def _within(records: Sequence[Record], other_records: Sequence[Record]) -> bool:
     """Tell whether all numbers of a row are among those of another."""
-    known = {(r.position, r.seed, r.status): r.per_trajectory for r in others}
+    terms = {(r.position, r.seed, r.status): r.per_trajectory for r in other_records}
     keys = [(r.position, r.seed, r.status) for r in records]
     return all(
-        key in known and same_terms(known[key], r.per_trajectory)
+        key in terms and same_terms(terms[key], r.per_trajectory)
         for key, r in zip(keys, records, strict=True)
     )
 
@@ -335,7 +337,7 @@ def rankings(ranks: RankedBoard, marked: Collection[Setting] = ()) -> list[Table
         names = ranks.board.present(names)
     lines = rows(standings, ranks.alarms, by_alarms.name, *names)
     censored = by_alarms.unit == "steps"
-    what = f"{by_alarms.noun} (steps)" if censored else f"{by_alarms.title.removesuffix(level)}(%)"
+    title = f"{by_alarms.noun} (steps)" if censored else f"{by_alarms.title.removesuffix(level)}(%)"
     header = [
         by_alarms.noun if censored else "found",
         *(_BESIDE[n.removesuffix(f"_{suffix}")] for n in names),
@@ -348,7 +350,7 @@ def rankings(ranks: RankedBoard, marked: Collection[Setting] = ()) -> list[Table
             labels=2,
         ),
         Table(
-            f"Ranking by guaranteed alarms {level}: {what}, {by_alarms.better} is better",
+            f"Ranking by guaranteed alarms {level}: {title}, {by_alarms.better} is better",
             ["rank", "row", *header],
             lines,
             labels=2,

@@ -105,19 +105,19 @@ def selected(
         raise UsageError("these results have no records: expected those of a finished run")
     names = select("detector of these results", detectors, sorted({r.detector for r in records}))
     matches = expression(cells) if cells else lambda _: True
-    chosen = [r for r in records if r.detector in names and matches(str(r.cell))]
-    if not chosen:
+    kept = [r for r in records if r.detector in names and matches(str(r.cell))]
+    if not kept:
         raise UsageError(f"-k {cells!r} selects none of the {len(records)} records")
     left_out: list[str] = []
     if complete:
-        chosen, left_out = _complete(chosen)
-    environments = in_order((r.environment for r in chosen), ENVIRONMENTS)
-    anomalies = in_order((r.anomaly for r in chosen), ANOMALIES)
-    chosen.sort(
+        kept, left_out = _complete(kept)
+    environments = in_order((r.environment for r in kept), ENVIRONMENTS)
+    anomalies = in_order((r.anomaly for r in kept), ANOMALIES)
+    kept.sort(
         key=lambda r: (environments.index(r.environment), anomalies.index(r.anomaly), r.strength)
     )
-    chosen.sort(key=lambda r: (r.detector, r.horizon, r.seed, r.setting.overrides_json))
-    return [_publishable(r) for r in chosen], left_out
+    kept.sort(key=lambda r: (r.detector, r.horizon, r.seed, r.setting.overrides_json))
+    return [_publishable(r) for r in kept], left_out
 
 
 def _complete(records: Sequence[Record]) -> tuple[list[Record], list[str]]:

@@ -57,7 +57,7 @@ class DetectorHandle:
         """Make a detector of a name or class, or take an instance, for so many baseline rows."""
         seed = read("seed", partial(whole_number, least=0), seed)
         horizon = read("horizon", partial(whole_number, least=1), horizon)
-        kind = next((one for one in STATISTICS if one == statistic), None)
+        kind = next((kind for kind in STATISTICS if kind == statistic), None)
         if kind is None and statistic is not None:
             expected = ", ".join(map(repr, STATISTICS))
             raise UsageError(f"statistic={statistic!r}, expected one of {expected}")

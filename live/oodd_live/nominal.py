@@ -124,13 +124,13 @@ class NominalData:
         widths = [(x.observations if isinstance(x, Trajectory) else x[0]).shape[1] for x in raw[0]]
         width = widths[0] if widths else 0
         subtracted = _offsets(offsets, arrays, width)
-        training, others = ([_trajectory(x, subtracted) for x in part] for part in raw)
+        training, calibrating = ([_trajectory(x, subtracted) for x in part] for part in raw)
         names = sensor_names(sensors, width)
         if rows:
-            check_baseline(map(len, others), rows, "calibration")
+            check_baseline(map(len, calibrating), rows, "calibration")
         base = Baseline.fit(training, rows) if rows else None
         nominal = Nominal(names, subtracted, base)
-        return cls(training, others, further, nominal, rate, recorded)
+        return cls(training, calibrating, further, nominal, rate, recorded)
 
     def findings(self) -> list[PromiseFinding]:
         """Return what was tested about the promise."""

@@ -180,7 +180,7 @@ class Reading:
             "onset": "" if self.onset is None else str(self.onset),
         }
         values |= {f"sensor {sensor}": f"{share:.3f}" for sensor, share in self.sensors.items()}
-        values |= {f"fault {what}": fault for what, fault in self.faults.items()}
+        values |= {f"fault {source}": fault for source, fault in self.faults.items()}
         status = {
             "level": level,
             "name": name,
@@ -245,5 +245,5 @@ def as_nanoseconds(time: float) -> int:
     >>> as_nanoseconds(1.5e9 + 0.25)
     1500000000250000000
     """
-    whole = math.floor(time)
-    return whole * 10**9 + round((time - whole) * 1e9)
+    seconds = math.floor(time)
+    return seconds * 10**9 + round((time - seconds) * 1e9)

@@ -90,10 +90,10 @@ class StreamLimits:
         lengths = np.array([max(1, len(e)) for e in equal])[:, None]
         constant = (longest >= CONSTANT * lengths).any(axis=0)
         moving = np.array(~constant)
-        whole = [_repeats(e, moving) for e in equal]
-        runs = [_longest_runs(e[~w]) for e, w in zip(equal, whole, strict=True)]
+        repeats = [_repeats(e, moving) for e in equal]
+        runs = [_longest_runs(e[~r]) for e, r in zip(equal, repeats, strict=True)]
         still = np.where(constant, np.inf, np.max(runs, axis=0))
-        repeated = max(map(_largest_count, whole))
+        repeated = max(map(_largest_count, repeats))
         rest = np.concatenate([x.actions for x in episodes]).mean(axis=0, dtype=np.float64)
         low = np.min([x.observations.min(axis=0) for x in inside], axis=0).astype(np.float64)
         high = np.max([x.observations.max(axis=0) for x in inside], axis=0)
@@ -127,9 +127,9 @@ class StreamLimits:
         stream = Stream(self, baseline=baseline)
         faults: dict[int | str, StreamFault] = {}
         for t in stream.through(trajectory.observations, trajectory.actions):
-            for what, fault in stream.faults.items():
-                first = faults[what].first if what in faults else t
-                faults[what] = StreamFault(fault, first, t)
+            for source, fault in stream.faults.items():
+                first = faults[source].first if source in faults else t
+                faults[source] = StreamFault(fault, first, t)
         return faults
 
 
@@ -286,12 +286,12 @@ class Stream:
             late = not rate * (time - acted) <= 1 + TOLERANCE
             self._count(ACTION, "late", happened=late)
 
-    def _count(self, what: str, fault: str, *, happened: bool) -> None:
-        count = _counted(self._counts[what, fault], happened)
-        self._counts[what, fault] = count
+    def _count(self, source: str, fault: str, *, happened: bool) -> None:
+        count = _counted(self._counts[source, fault], happened)
+        self._counts[source, fault] = count
         self._quiet = self._quiet and not count
 
-    def _read(self, what: str, values: ArrayLike | None, width: int) -> NDArray[np.float32]:
+    def _read(self, source: str, values: ArrayLike | None, width: int) -> NDArray[np.float32]:
         """Return values as float32, NaN for what is missing."""
         if values is None:
             return np.full(width, np.nan, np.float32)
@@ -299,7 +299,7 @@ class Stream:
             row = np.asarray(values, dtype=np.float64).astype(np.float32)
         if row.shape != (width,):
             raise TrajectoryError(
-                f"the watchdog got an {what} of shape {row.shape}, expected ({width},) as "
+                f"the watchdog got an {source} of shape {row.shape}, expected ({width},) as "
                 "in its nominal trajectories: hand over NaN for what is missing, None for all"
             )
         return row
@@ -312,11 +312,11 @@ class Stream:
         wild = self._beyond > MISSING
         odd = (self._missing > 0) | (self._runs > limits.still) | wild
         self._since = np.where(odd, np.minimum(self._since, self._t), NEVER)
-        whole: dict[int | str, str] = {}
-        for (what, fault), count in self._counts.items():
-            if count > self._most[what, fault]:
-                whole.setdefault(what, fault)
-        self.suspects, self.faults = {}, whole
+        row_faults: dict[int | str, str] = {}
+        for (source, fault), count in self._counts.items():
+            if count > self._most[source, fault]:
+                row_faults.setdefault(source, fault)
+        self.suspects, self.faults = {}, row_faults
         if not odd.any():
             return
         self.suspects = {int(d): int(self._since[d]) for d in np.flatnonzero(odd)}
@@ -325,7 +325,7 @@ class Stream:
             int(d): "missing" if lost[d] else "frozen" if frozen[d] else "out of range"
             for d in np.flatnonzero(lost | frozen | wild)
         }
-        self.faults = {**sensors, **whole}
+        self.faults = {**sensors, **row_faults}
 
 
 def _repeats(equal: NDArray[np.bool_], moving: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -348,7 +348,7 @@ def _longest_runs(equal: NDArray[np.bool_]) -> Floats:
 
 def _largest_count(happened: NDArray[np.bool_]) -> float:
     count = largest = 0.0
-    for one in happened.tolist():
-        count = _counted(count, one)
+    for flag in happened.tolist():
+        count = _counted(count, flag)
         largest = max(largest, count)
     return largest

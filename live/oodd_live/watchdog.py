@@ -200,16 +200,16 @@ class Watchdog:
         if not (0 < alpha < 1 and (confidence is None or 0 < confidence < 1)):
             expected = "shares between 0 and 1"
             raise UsageError(f"alpha={alpha!r}, confidence={confidence!r}: expected {expected}")
-        training, others = data.train, data.calibration
+        training, calibrating = data.train, data.calibration
         least = least_episodes(alpha, handle.alarm, confidence) if hours is None else 1
-        if len(others) < least:
+        if len(calibrating) < least:
             subject = f"alpha={alpha!r}"
-            raise UsageError(too_few(subject, len(others), alpha, handle.alarm, confidence))
+            raise UsageError(too_few(subject, len(calibrating), alpha, handle.alarm, confidence))
         handle.detector.fit([handle.visible(x, nominal.baseline) for x in training])
         # Without a guarantee to keep exact, the limits may know what the threshold is from.
-        known = training if hours is None else training + others
-        limits = StreamLimits.fit(known, map(nominal.judged, known), margin)
-        scores = [handle.scores(x, nominal.baseline) for x in others]
+        limit_episodes = training if hours is None else training + calibrating
+        limits = StreamLimits.fit(limit_episodes, map(nominal.judged, limit_episodes), margin)
+        scores = [handle.scores(x, nominal.baseline) for x in calibrating]
         settings = Settings(alpha, confidence, rate, latch, hold_off)
         findings = data.findings()
         notes = [finding.text for finding in findings]
@@ -217,7 +217,7 @@ class Watchdog:
             if finding.doubt:
                 warnings.warn(finding.text, PromiseWarning, stacklevel=2)
         if hours is None:
-            faults = [limits.faults(x, nominal.baseline) for x in others]
+            faults = [limits.faults(x, nominal.baseline) for x in calibrating]
             fitted = _calibrated(scores, faults, handle.alarm)
             rule = _guaranteed(fitted, faults, settings, nominal.sensors)
             if any(faults):
@@ -516,27 +516,27 @@ class Watchdog:
         """
         detector = self._handle.detector
         if not isinstance(detector, StorableDetector):
-            what = f"{type(detector).__name__} has no state and restore"
-            raise UsageError(f"{what}: fit the watchdog anew where it is needed")
+            problem = f"{type(detector).__name__} has no state and restore"
+            raise UsageError(f"{problem}: fit the watchdog anew where it is needed")
         fitted = pack(detector.state(), type(detector).__name__)
-        scale, known = self.rule.standardization, self.calibration
+        scale, calibration = self.rule.standardization, self.calibration
         values = {
             "made": self._handle.state,
             "sensors": self.sensors,
             "threshold": self.rule.threshold,
             "standardization": scale and scale.numbers,
-            "calibration": known
+            "calibration": calibration
             and {
                 # JSON has no infinities, of which there are two: as texts.
-                "largest": [x if math.isfinite(x) else str(x) for x in known.largest],
-                "episodes": known.episodes,
-                "rolling": known.rolling,
+                "largest": [x if math.isfinite(x) else str(x) for x in calibration.largest],
+                "episodes": calibration.episodes,
+                "rolling": calibration.rolling,
             },
             "run_length": self.run_length and list(astuple(self.run_length)),
             "settings": asdict(self.settings),
             "notes": self.notes,
         }
-        whole = {
+        state = {
             "kind": KIND,
             "watchdog": values,
             "detector": fitted.values(),
@@ -544,7 +544,7 @@ class Watchdog:
             **self._nominal.arrays(),
             **{DETECTOR + name: array for name, array in fitted.arrays.items()},
         }
-        write_state(Path(path), pack(whole, "the watchdog"))
+        write_state(Path(path), pack(state, "the watchdog"))
 
     @classmethod
     def load(cls, path: str | Path, detector: AnyDetector | None = None) -> Self:
@@ -567,54 +567,54 @@ class Watchdog:
         FittedStateError
             When the file is missing, damaged, or of an earlier version.
         """
-        what = f"{str(path)!r} cannot be read as a saved watchdog"
-        whole = read_state(Path(path)).state()
-        if (kind := str(whole.get("kind"))) != KIND:
-            raise FittedStateError(f"{what}: it is {kind:.40}, expected {KIND}: fit it anew")
+        message = f"{str(path)!r} cannot be read as a saved watchdog"
+        state = read_state(Path(path)).state()
+        if (kind := str(state.get("kind"))) != KIND:
+            raise FittedStateError(f"{message}: it is {kind:.40}, expected {KIND}: fit it anew")
         try:
-            return cls._of(whole, detector)
+            return cls._of(state, detector)
         except OoddError:
             raise
         except Exception as error:  # the file may hold anything where values are expected
             problem = f"{type(error).__name__}: {error}"
-            raise FittedStateError(f"{what}: {problem:.500}; fit it anew") from error
+            raise FittedStateError(f"{message}: {problem:.500}; fit it anew") from error
 
     @classmethod
-    def _of(cls, whole: Mapping[str, Any], detector: AnyDetector | None) -> Self:
+    def _of(cls, state: Mapping[str, Any], detector: AnyDetector | None) -> Self:
         """Return the watchdog that all this was written of."""
-        values, limits = whole["watchdog"], StreamLimits.of(whole)
+        values, limits = state["watchdog"], StreamLimits.of(state)
         handle = DetectorHandle.from_state(values["made"], detector)
         names = [str(name) for name in values["sensors"]]
         if not isinstance(handle.detector, StorableDetector) or len(names) != len(limits.mean):
             raise FittedStateError(f"it does not fit {type(handle.detector).__name__}")
-        nominal = Nominal.of(whole, names, int(values["made"]["baseline"]))
-        scale, known, length = (
+        nominal = Nominal.of(state, names, int(values["made"]["baseline"]))
+        scale, calibration_values, length = (
             values[name] for name in ("standardization", "calibration", "run_length")
         )
         standardization = scale and Standardization(*map(_finite, scale))
-        calibration = known and Calibration(
+        calibration = calibration_values and Calibration(
             handle.alarm,
             standardization,
-            tuple(map(float, known["largest"])),
-            int(known["episodes"]),
-            bool(known["rolling"]),
+            tuple(map(float, calibration_values["largest"])),
+            int(calibration_values["episodes"]),
+            bool(calibration_values["rolling"]),
         )
-        chosen = values["settings"]
+        setting_values = values["settings"]
         settings = Settings(
-            alpha=_finite(chosen["alpha"]),
-            confidence=chosen["confidence"] and _finite(chosen["confidence"]),
-            rate=chosen["rate"] and _finite(chosen["rate"]),
-            latch=bool(chosen["latch"]),
-            hold_off=int(chosen["hold_off"]),
+            alpha=_finite(setting_values["alpha"]),
+            confidence=setting_values["confidence"] and _finite(setting_values["confidence"]),
+            rate=setting_values["rate"] and _finite(setting_values["rate"]),
+            latch=bool(setting_values["latch"]),
+            hold_off=int(setting_values["hold_off"]),
         )
         rule = GuaranteedAlarm(standardization, _finite(values["threshold"]))
         run_length = length and RunLength(*map(_finite, length))
         arrays = {
             name.removeprefix(DETECTOR): array
-            for name, array in whole.items()
+            for name, array in state.items()
             if name.startswith(DETECTOR)
         }
-        handle.detector.restore({**whole["detector"], **arrays})
+        handle.detector.restore({**state["detector"], **arrays})
         notes = [str(note) for note in values["notes"]]
         return cls(handle, calibration, rule, limits, nominal, settings, run_length, notes)
 
@@ -642,10 +642,10 @@ def _calibrated(
 
 
 def _guaranteed(
-    known: Calibration, faults: Sequence[_Faults], settings: Settings, sensors: Sequence[str]
+    calibration: Calibration, faults: Sequence[_Faults], settings: Settings, sensors: Sequence[str]
 ) -> GuaranteedAlarm:
     """Return the alarm; `UsageError` names what is at fault where nothing could exceed it."""
-    threshold = known.threshold(settings.alpha, settings.confidence)
+    threshold = calibration.threshold(settings.alpha, settings.confidence)
     if math.isinf(threshold) and any(faults):
         raise UsageError(
             f"alpha={settings.alpha!r} cannot be promised, as {_faults_note(faults, sensors)}: no "
@@ -653,14 +653,14 @@ def _guaranteed(
             "declare baseline rows, let readings leave training's range by more (margin=), or "
             "promise less"
         )
-    return known.rule(settings.alpha, settings.confidence)
+    return calibration.rule(settings.alpha, settings.confidence)
 
 
 def _faults_note(faults: Sequence[_Faults], sensors: Sequence[str]) -> str:
     """Name the calibration episodes, sensors and rows at fault."""
 
-    def in_words(what: int | str, seen: StreamFault) -> str:
-        name = sensors[what] if isinstance(what, int) else what
+    def in_words(source: int | str, seen: StreamFault) -> str:
+        name = sensors[source] if isinstance(source, int) else source
         return f"{name} {seen.fault} in rows {seen.first} to {seen.last}"
 
     listed = [

@@ -102,8 +102,8 @@ class VectorWatchdogWrapper(gymnasium.vector.VectorWrapper[Any, Any, Any, Any, A
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Begin new episodes: of all, or of those in ``options["reset_mask"]``."""
-        chosen = (options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool))
-        mask = np.array(chosen, dtype=bool)
+        reset_mask = (options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool))
+        mask = np.array(reset_mask, dtype=bool)
         observations, info = self.env.reset(seed=seed, options=options)
         self._over = np.where(mask, False, self._over)
         return observations, info | self._readings(self._rows(observations), None, mask, mask)
@@ -183,10 +183,10 @@ def _check_spaces(
     observations: gymnasium.Space[Any], actions: gymnasium.Space[Any], watchdog: Watchdog
 ) -> None:
     """Raise `UsageError` unless both spaces are flat rows, and observations of the sensors."""
-    for what, space in (("observation", observations), ("action", actions)):
+    for name, space in (("observation", observations), ("action", actions)):
         if unfit := next(_unfit(space), None):
             raise UsageError(
-                f"the {what} space has {unfit}, which is no fixed number of readings: leave it out "
+                f"the {name} space has {unfit}, which is no fixed number of readings: leave it out "
                 "with a wrapper below this one, such as gymnasium.wrappers.FilterObservation"
             )
     readings, sensors = spaces.flatdim(observations), len(watchdog.sensors)

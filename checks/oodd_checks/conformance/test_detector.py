@@ -241,8 +241,8 @@ def test_deterministic(trial: Trial) -> None:
     trial.fitted()
     if not trial.spec.deterministic:
         pytest.skip("does not say that the seed changes nothing")
-    what = f"a detector of seed {trial.seed + 1} has other scores than one of seed {trial.seed}"
-    trial.must_agree(trial.fit(seed=trial.seed + 1), what, "expected deterministic=False")
+    failure = f"a detector of seed {trial.seed + 1} has other scores than one of seed {trial.seed}"
+    trial.must_agree(trial.fit(seed=trial.seed + 1), failure, "expected deterministic=False")
 
 
 def test_refit(trial: Trial) -> None:
@@ -252,8 +252,8 @@ def test_refit(trial: Trial) -> None:
     with doing("a second fit"):
         detector.fit(trial.training(first=6000))
         detector.fit(trial.training())
-    what = "a detector that was fitted on something else before has other scores"
-    trial.must_agree(detector, what, "fit has to begin anew")
+    failure = "a detector that was fitted on something else before has other scores"
+    trial.must_agree(detector, failure, "fit has to begin anew")
 
 
 def test_order(trial: Trial) -> None:
@@ -262,9 +262,9 @@ def test_order(trial: Trial) -> None:
     trajectories = [*trial.nominal(), *trial.anomalous(1)[0][:2]]
     first = [trial.scores(x) for x in trajectories]
     again = [trial.scores(x) for x in reversed(trajectories)][::-1]
-    what = "scores of a trajectory change with what was scored before"
-    for one, other in zip(first, again, strict=True):
-        assert_equal(other, one, what, "score must not keep anything")
+    failure = "scores of a trajectory change with what was scored before"
+    for expected, scores in zip(first, again, strict=True):
+        assert_equal(scores, expected, failure, "score must not keep anything")
 
 
 def test_score_many(trial: Trial) -> None:
@@ -273,25 +273,25 @@ def test_score_many(trial: Trial) -> None:
         pytest.skip("has no score_many")
     trajectories = [*trial.nominal(), trial.anomalous(1)[0][0]]
     alone = [trial.scores(x) for x in trajectories]
-    for chosen in (range(len(trajectories)), (3, 1), (2,)):
-        company, n = [trajectories[i] for i in chosen], f"{len(chosen)} trajectories"
+    for indices in (range(len(trajectories)), (3, 1), (2,)):
+        company, n = [trajectories[i] for i in indices], f"{len(indices)} trajectories"
         with doing("score_many"):
             returned = list(together(company))
         assert len(returned) == len(company), (
             f"score_many returned {len(returned)} score arrays for {n}"
         )
-        for i, x, scores in zip(chosen, company, returned, strict=True):
-            what = f"score_many of {n} differs from score"
-            assert_equal(as_scores(scores, x), alone[i], what, tolerance=trial.tolerance)
+        for i, x, scores in zip(indices, company, returned, strict=True):
+            failure = f"score_many of {n} differs from score"
+            assert_equal(as_scores(scores, x), alone[i], failure, tolerance=trial.tolerance)
 
 
 def test_prefix(trial: Trial) -> None:
     """The scores of a prefix are the prefix of the scores."""
     trajectory = trial.nominal(1)[0]
-    whole = trial.scores(trajectory)
+    scores = trial.scores(trajectory)
     for n in (1, 2, *_rows(trial), len(trajectory) - 1):
-        what = f"the first {n} of {len(trajectory)} observations alone have other scores"
-        assert_equal(trial.scores(trajectory[:n]), whole, what, tolerance=trial.tolerance)
+        failure = f"the first {n} of {len(trajectory)} observations alone have other scores"
+        assert_equal(trial.scores(trajectory[:n]), scores, failure, tolerance=trial.tolerance)
 
 
 def test_streaming(trial: Trial) -> None:
@@ -300,8 +300,8 @@ def test_streaming(trial: Trial) -> None:
     # The second episode is left in the middle, so that the next one has to begin anew.
     first, second, third = trial.nominal(3)
     for trajectory in (first, second[: len(second) // 2], third):
-        whole, what = trial.scores(trajectory), "update differs from score of the whole episode"
-        assert_equal(_streamed(detector, trajectory), whole, what, tolerance=trial.tolerance)
+        scores, failure = trial.scores(trajectory), "update differs from score of the whole episode"
+        assert_equal(_streamed(detector, trajectory), scores, failure, tolerance=trial.tolerance)
 
 
 def _streamed(detector: StreamingDetector, trajectory: Trajectory) -> Scores:
@@ -316,15 +316,15 @@ def test_explain(trial: Trial) -> None:
     if not explains(trial.fitted()):
         pytest.skip("has no explain")
     trajectory = noisy_from(trial.nominal(1)[0], trial.rows // 3)
-    scores, whole = trial.scores(trajectory), _explanation(trial, trajectory)
-    wrong = np.isnan(scores) != (whole.onsets < 0)
+    scores, expected = trial.scores(trajectory), _explanation(trial, trajectory)
+    wrong = np.isnan(scores) != (expected.onsets < 0)
     t = int(wrong.argmax())
     assert not wrong.any(), (
-        f"explain gives the onset {whole.onsets[t]} at t = {t}, where the score is {scores[t]}: "
+        f"explain gives the onset {expected.onsets[t]} at t = {t}, where the score is {scores[t]}: "
         "expected -1, and shares of NaN, where it is NaN only"
     )
     for n in _rows(trial):
-        different = _difference(_explanation(trial, trajectory[:n]), whole)
+        different = _difference(_explanation(trial, trajectory[:n]), expected)
         assert not different, (
             f"the first {n} of {len(trajectory)} observations alone have other {different[0]}: "
             "explain may use nothing after a row's time"
@@ -339,7 +339,7 @@ def test_explain(trial: Trial) -> None:
             detector.update(*row)
             rows.append(detector.explain_last())
         shares, onsets = np.stack([s for s, _ in rows]), np.array([int(o) for _, o in rows])
-    different = _difference(Explanation(shares, onsets), whole)
+    different = _difference(Explanation(shares, onsets), expected)
     assert not different, (
         f"explain_last gives other {different[0]} than explain, first at t = {different[1]}: "
         "expected the row of explain for the latest update"
@@ -353,14 +353,14 @@ def _explanation(trial: Trial, trajectory: Trajectory) -> Explanation:
     return checked_explanation(returned, trajectory)
 
 
-def _difference(rows: Explanation, whole: Explanation) -> tuple[str, int] | None:
+def _difference(rows: Explanation, expected: Explanation) -> tuple[str, int] | None:
     """Return what differs between the explanation of first rows and the whole, and from where."""
     n = len(rows.onsets)
-    near = np.isclose(rows.shares, whole.shares[:n], 0, TOLERANCE, equal_nan=True)
-    for what, same in (("shares", near), ("onsets", rows.onsets == whole.onsets[:n])):
+    near = np.isclose(rows.shares, expected.shares[:n], 0, TOLERANCE, equal_nan=True)
+    for name, same in (("shares", near), ("onsets", rows.onsets == expected.onsets[:n])):
         # Rounding may turn a few.
         if (~same).mean() > FLIPPED:
-            return what, int(np.argwhere(~same)[0, 0])
+            return name, int(np.argwhere(~same)[0, 0])
     return None
 
 
@@ -372,8 +372,8 @@ def _rows(trial: Trial) -> tuple[int, ...]:
 def test_short_trajectories(trial: Trial) -> None:
     """Episodes of one and two observations, and as short as the horizon, are scored."""
     for n in sorted({1, 2, trial.horizon, trial.horizon + 1}):
-        what = f"an episode of {counted(n, 'observation(s)')}"
-        _must_be_finite(trial, trial.fitted(), trial.episode(7, n), what)
+        subject = f"an episode of {counted(n, 'observation(s)')}"
+        _must_be_finite(trial, trial.fitted(), trial.episode(7, n), subject)
 
 
 def test_constant_trajectory(trial: Trial) -> None:
@@ -388,9 +388,9 @@ def test_constant_sensor(trial: Trial) -> None:
     """A sensor that never moved in training is no reason for infinite scores when it does."""
     trial.fitted()
     detector = trial.fit([_with_constant_sensor(x) for x in trial.training()])
-    nominal, what = trial.nominal(1)[0], "an episode with a sensor that"
-    _must_be_finite(trial, detector, _with_constant_sensor(nominal), f"{what} stands still")
-    _must_be_finite(trial, detector, nominal, f"{what} stood still in training only")
+    nominal, subject = trial.nominal(1)[0], "an episode with a sensor that"
+    _must_be_finite(trial, detector, _with_constant_sensor(nominal), f"{subject} stands still")
+    _must_be_finite(trial, detector, nominal, f"{subject} stood still in training only")
 
 
 def test_unequal_lengths(trial: Trial) -> None:
@@ -408,22 +408,22 @@ def _with_constant_sensor(trajectory: Trajectory) -> Trajectory:
     return Trajectory(observations, trajectory.actions)
 
 
-def _must_be_finite(trial: Trial, detector: Detector, trajectory: Trajectory, what: str) -> None:
+def _must_be_finite(trial: Trial, detector: Detector, trajectory: Trajectory, subject: str) -> None:
     """Refuse infinite scores, and undefined ones where an ordinary episode has none."""
-    with doing(f"score of {what}"):
+    with doing(f"score of {subject}"):
         scores = trial.scores(trajectory, detector)
         usual = trial.scores(trial.episode(0, len(trajectory)))
     wrong = np.flatnonzero(np.isinf(scores) | (np.isnan(scores) & ~np.isnan(usual)))
     assert not wrong.size, (
-        f"{what} has the score {scores[wrong[0]]} at t = {wrong[0]}: expected finite ones"
+        f"{subject} has the score {scores[wrong[0]]} at t = {wrong[0]}: expected finite ones"
     )
 
 
 def test_state(trial: Trial) -> None:
     """A new detector that restores a state, which scoring leaves alone, gives the same scores."""
     packed, detector = _packed(trial), trial.fitted()
-    restored, what = _restored(trial, packed), "a detector that restored a state differs"
-    trial.must_agree(restored, what)
+    restored, failure = _restored(trial, packed), "a detector that restored a state differs"
+    trial.must_agree(restored, failure)
     again = _packed(trial)
     assert again.text == packed.text, "state() differs after scoring: expected what fit learned"
     for name, array in packed.arrays.items():
@@ -437,7 +437,7 @@ def test_state(trial: Trial) -> None:
         except RaisedError:
             pytest.skip("needs update: see check 'streaming'")
         # Sums of one row and of many can have another order, which may depend on how arrays lie.
-        assert_equal(_streamed(restored, x), expected, f"row by row, {what}")
+        assert_equal(_streamed(restored, x), expected, f"row by row, {failure}")
 
 
 def test_shared_fit(trial: Trial) -> None:
@@ -446,11 +446,13 @@ def test_shared_fit(trial: Trial) -> None:
     if trial.spec.horizon_decides_fit:
         pytest.skip("does not say that fits ignore the horizon")
     other = trial.horizon + 2
-    what = f"a fit of horizon {trial.horizon}, restored for horizon {other}, differs from a fit of "
+    failure = (
+        f"a fit of horizon {trial.horizon}, restored for horizon {other}, differs from a fit of "
+    )
     advice = "expected horizon_decides_fit=True"
     x, restored = trial.nominal(1)[0], _restored(trial, packed, horizon=other)
     expected = trial.scores(x, trial.fit(horizon=other))
-    assert_equal(trial.scores(x, restored), expected, f"{what}horizon {other}", advice)
+    assert_equal(trial.scores(x, restored), expected, f"{failure}horizon {other}", advice)
 
 
 def _packed(trial: Trial) -> PackedState:

@@ -119,8 +119,8 @@ def submit(options: Options) -> int:
     texts = {name: getattr(options, name) or "" for name in names}
     texts["citation"] = " ".join(texts["citation"].split())
     statement = submission.Statement(**texts, primary=options.primary)
-    chosen = ("detectors", "complete", "curves", "split")
-    how = {name: getattr(options, name) for name in chosen} | {"cells": options.expression}
+    option_names = ("detectors", "complete", "curves", "split")
+    how = {name: getattr(options, name) for name in option_names} | {"cells": options.expression}
     submitted = submission.submit(options.directory, options.results, statement, **how)
     console, path = make_console(), submitted.path
     for line in submitted.left_out if options.verbosity >= 0 else ():
@@ -183,7 +183,7 @@ def verify(options: Options) -> int:
 
 def verify_pull_request(console: Console, results: Path, options: Options) -> int:
     """Check what a branch changes; 1 when it may not be merged as the pull request of an entry."""
-    entries, others = changes_against(options.changed_against, results)
+    entries, other_files = changes_against(options.changed_against, results)
     if not entries:
         console.print(f"no entry differs from {options.changed_against}: nothing to verify")
         return 0
@@ -191,11 +191,11 @@ def verify_pull_request(console: Console, results: Path, options: Options) -> in
     for verdict in check_changed(results, entries):
         report(console, verdict, options.verbosity)
         refused += not verdict.ok
-    for path in others[:MOST_SHOWN]:
+    for path in other_files[:MOST_SHOWN]:
         console.print(f"{path}: is changed together with an entry")
-    if others:
-        if len(others) > MOST_SHOWN:
-            console.print(f"and {len(others) - MOST_SHOWN} more files")
+    if other_files:
+        if len(other_files) > MOST_SHOWN:
+            console.print(f"and {len(other_files) - MOST_SHOWN} more files")
         return say(
             f"a pull request of an entry changes {results}/NAME/ and nothing else: take the files "
             "above out of it",
@@ -254,15 +254,15 @@ def changes_against(base: str, results: Path) -> Changes:
     changed = _git(top, "diff", "--name-only", "--no-renames", "--no-ext-diff", "-z", fork)
     root = PurePosixPath(Path(os.path.relpath(results.resolve(), top.resolve())).as_posix())
     added = _git(top, "ls-files", "--others", "--exclude-standard", "-z", "--", str(root))
-    entries, others = set[str](), set[str]()
+    entries, other_files = set[str](), set[str]()
     for text in filter(None, f"{changed}{added}".split("\0")):
         path = PurePosixPath(text)
         below = path.relative_to(root).parts if path.is_relative_to(root) else ()
         if len(below) > 1:
             entries.add(below[0])
         else:
-            others.add(text)  # a file beside the entries is none of them
-    return Changes(sorted(entries), sorted(others))
+            other_files.add(text)  # a file beside the entries is none of them
+    return Changes(sorted(entries), sorted(other_files))
 
 
 def _git(directory: Path, *arguments: str) -> str:

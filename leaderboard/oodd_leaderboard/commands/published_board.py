@@ -57,9 +57,9 @@ def show(options: Options) -> int:
     if options.split:
         names = {board.records[0].split for board in published.boards}
         check_known("split with a published board", sorted(names), options.split)
-    chosen = [b for b in published.boards if options.split in (None, b.records[0].split)]
+    boards = [b for b in published.boards if options.split in (None, b.records[0].split)]
     output = _Output(options)
-    for board in chosen:
+    for board in boards:
         ranks = board.ranks()
         notes = [REPORTED, *tables.ranking_notes(ranks, whole=False), *_of_entries(board)]
         output.print(

@@ -106,7 +106,7 @@ class _Describer:
             form, described = answer["form"], answer["specs"]
             if not is_line(form) or len(described) > MOST_SPECS:
                 raise PluginError(f"it describes {len(described)} detectors, and {form!r:.80}")
-            specs = [spec_of(one, _in_a_sandbox) for one in described]
+            specs = [spec_of(description, _in_a_sandbox) for description in described]
 
         def ask(text: str) -> Answer:
             return _unbroken(self._ask(distribution, [point.name], text)[point.name])

@@ -145,10 +145,10 @@ def _board(section: LeaderboardSection, units: Units, parts: dict[str, Json]) ->
     have = {(r.environment, r.anomaly) for r in board.records}
     cells = [c for c in product(board.environments, board.anomalies) if c in have]
     names_of_logs = None if board.paired else _names_of_logs(board)
-    chosen = selections(cells, names_of_logs)
+    filtered = selections(cells, names_of_logs)
     rows, ends, by_cell = [], {}, {}
     for standing in ranks.standings:
-        row, part = _row(section, standing, names, chosen, units)
+        row, part = _row(section, standing, names, filtered, units)
         rows.append(row)
         parts[row["part"]] = part
         ends[row["part"]] = _ranking_intervals(part, board, names)
@@ -209,15 +209,15 @@ def _row(
     section: LeaderboardSection,
     standing: Standing,
     names: Sequence[str],
-    chosen: Mapping[str, Sequence[SelectedCell]],
+    filtered: Mapping[str, Sequence[SelectedCell]],
     units: Units,
 ) -> tuple[Json, Json]:
     """Return a row's line of the index, and its part."""
     row, records = standing.entry, standing.records
     source, label, ranks = section.sources[row], str(row), section.ranks
-    order = {cell: i for i, cell in enumerate(chosen["all|all"])}
+    order = {cell: i for i, cell in enumerate(filtered["all|all"])}
     in_order = sorted(records, key=lambda r: (order[r.environment, r.anomaly], r.seed))
-    intervals = _intervals(ranks.board, standing, names, chosen)
+    intervals = _intervals(ranks.board, standing, names, filtered)
     identity = f"{section.name}/{label}"
     have = {(r.environment, r.anomaly) for r in records}
     line = {
@@ -235,13 +235,13 @@ def _row(
         "lead": standing.lead,
         "cost": {n: _short(v) for n, v in standing.cost._asdict().items()},
         **_fields(source.meta, "submitter", "caption"),
-        "missing": [i for i, cell in enumerate(chosen.get("all|all", [])) if cell not in have],
+        "missing": [i for i, cell in enumerate(filtered.get("all|all", [])) if cell not in have],
         "failed": [
-            [chosen["all|all"].index((r.environment, r.anomaly)), r.status, r.reason]
+            [filtered["all|all"].index((r.environment, r.anomaly)), r.status, r.reason]
             for r in in_order
             if not r.ok
         ],
-        "means": _summaries(section, standing, names, chosen, intervals),
+        "means": _summaries(section, standing, names, filtered, intervals),
     }
     compared = [c for c in ranks.ranking.comparisons if label in (c.first, c.second)]
     part = {
@@ -257,7 +257,9 @@ def _row(
             if c.first == label
         ],
         "worse_than": [c.first for c in compared if c.second == label and c.better],
-        "wins": {other: _short(rate) for (one, other), rate in ranks.rates.items() if one == label},
+        "wins": {
+            other: _short(rate) for (first, other), rate in ranks.rates.items() if first == label
+        },
         "curves": _curves(units.get(source.meta.id, []), records),
     }
     return line, part
@@ -267,14 +269,14 @@ def _summaries(
     section: LeaderboardSection,
     standing: Standing,
     names: Sequence[str],
-    chosen: Mapping[str, Sequence[SelectedCell]],
+    filtered: Mapping[str, Sequence[SelectedCell]],
     intervals: Json,
 ) -> dict[str, list[list[int | None]]]:
     """Return means over the selections of the index: values, then low and high ends."""
     # They are whole numbers of the last digit that is printed, None where there is none.
     board, summaries = section.ranks.board, {}
-    for key in (key for key in SUMMARIES if key in chosen):
-        means = [board.mean(standing.entry, *_sides(chosen[key]), name) for name in names]
+    for key in (key for key in SUMMARIES if key in filtered):
+        means = [board.mean(standing.entry, *_sides(filtered[key]), name) for name in names]
         values = [_digits(m.value, name) for m, name in zip(means, names, strict=True)]
         with_ends = _with_intervals(names, board)
         ends_of = intervals.get(key, [None] * len(with_ends))
@@ -344,13 +346,13 @@ def _intervals(
     board: Board,
     standing: Standing,
     names: Sequence[str],
-    chosen: Mapping[str, Sequence[SelectedCell]],
+    filtered: Mapping[str, Sequence[SelectedCell]],
 ) -> Json:
     """Intervals of means by key of the selection, in the order of the board's ``intervals``."""
     # A single record has its own.
     metrics = _with_intervals(names, board)
     intervals: dict[str, list[list[float | None] | None]] = {}
-    for (i, metric), (key, cells) in product(enumerate(metrics), chosen.items()):
+    for (i, metric), (key, cells) in product(enumerate(metrics), filtered.items()):
         selected = metric == board.ranking or key in SUMMARIES
         if not selected or len(cells) == standing.seeds == 1:
             continue
@@ -389,11 +391,11 @@ def gridded(example: Json) -> Json:
         ("score_step", 1.0, ("scores", "twin")),
         ("cusum_step", THRESHOLD, ("cusum", "twin_cusum")),
     ):
-        known = [name for name in names if name in example]
-        step = _step((v for name in known for v in example[name] if v is not None), unit)
+        present = [name for name in names if name in example]
+        step = _step((v for name in present for v in example[name] if v is not None), unit)
         steps[step_name] = step
         if step is not None:
-            for name in known:
+            for name in present:
                 steps[name] = [None if v is None else round(v / step) for v in example[name]]
     return steps
 
@@ -464,11 +466,11 @@ def selections(
         for name in ("all", group(anomaly), anomaly):
             anomalies.setdefault(name, set()).add(anomaly)
     selected = {
-        f"{some}|{others}": [(e, a) for e, a in cells if e in environments[some] and a in named]
+        f"{some}|{label}": [(e, a) for e, a in cells if e in environments[some] and a in named]
         for some in environments
-        for others, named in anomalies.items()
+        for label, named in anomalies.items()
     }
-    return {key: chosen for key, chosen in selected.items() if chosen}
+    return {key: selection for key, selection in selected.items() if selection}
 
 
 def shipped_split(digest: str) -> Split | None:
@@ -509,5 +511,5 @@ def _title(sensor: Quantity) -> str:
 def _sensor(name: str, episode: NDArray[Any], twin: NDArray[Any]) -> Json:
     values = np.concatenate([episode, twin]).astype(np.float64)
     step = float(f"{max(np.ptp(values) / STEPS, 1e-9):.2g}")
-    whole = np.round(values / step).astype(int).tolist()
-    return {"name": name, "step": step, "own": whole[: len(episode)], "twin": whole[len(episode) :]}
+    steps = np.round(values / step).astype(int).tolist()
+    return {"name": name, "step": step, "own": steps[: len(episode)], "twin": steps[len(episode) :]}

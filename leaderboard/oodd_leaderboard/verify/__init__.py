@@ -83,8 +83,8 @@ def verify_entry(
         _check_info(entry, name, findings)
         check_digests(contents, entry.files, findings)
     records = read_records(contents, findings)
-    for where, record in records.items():
-        check_record(where, record, findings)
+    for location, record in records.items():
+        check_record(location, record, findings)
     if entry is None or not records:
         return EntryVerdict(name, findings, records, entry)
     _check_statements(entry, records, findings)
@@ -114,7 +114,7 @@ def _check_info(entry: EntryInfo, name: str, findings: Findings) -> None:
     # name carries the start of its digest.
     findings.expect(ENTRY, "id", name, entry.id, "the name of its directory")
     published, split, digest = published_digests(), entry.split, entry.split_digest
-    names = [known for known, other in published.items() if other == digest]
+    names = [split_name for split_name, other in published.items() if other == digest]
     if not digest.startswith(split.partition("@")[2]):
         findings.refuse(ENTRY, "split", f"is {split!r}, but split_digest is {digest[:8]}…")
     if names and split not in names:
@@ -229,11 +229,11 @@ class Neighbours:
 
     def check(self, verdict: EntryVerdict) -> None:
         """Refuse rows of other entries, and detectors' names from other distributions."""
-        for where, record in verdict.records.items():
+        for location, record in verdict.records.items():
             if (other := self._rows.setdefault(row_of(record), verdict.name)) != verdict.name:
                 message = f"is of a row of entry {other} too: replace that one, or leave it out"
-                verdict.findings.refuse(where, "cell", message)
+                verdict.findings.refuse(location, "cell", message)
             origin = record.plugin.partition(":")[0]
             owner, first = self._origins.setdefault(record.detector, (verdict.name, origin))
             why = f"as in entry {owner}: a name stands for one detector"
-            verdict.findings.expect(where, "detector", f"from {first}", f"from {origin}", why)
+            verdict.findings.expect(location, "detector", f"from {first}", f"from {origin}", why)

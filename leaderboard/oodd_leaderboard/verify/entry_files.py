@@ -112,8 +112,8 @@ def read_files(entry: Path, findings: Findings) -> dict[str, bytes]:
         else:
             sound.append(name)
     for name in MOST_PLAIN:
-        first, *others = [form for form in forms(name) if form in listed] or [name]
-        for other in others:
+        first, *other_forms = [form for form in forms(name) if form in listed] or [name]
+        for other in other_forms:
             findings.refuse(other, "", f"is there beside {first}: expected one of the two")
     for name in (ENTRY, RECORDS):
         if listed.keys().isdisjoint(forms(name)):

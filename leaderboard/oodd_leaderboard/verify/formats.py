@@ -223,21 +223,21 @@ def unsafe(value: Any, path: str = "", levels: int = _DEEPEST) -> Iterator[tuple
         yield path, f"is {short(value)}, expected a finite number, whole ones of at most {LARGEST}"
 
 
-def _read(kind: Any, text: str, where: str, findings: Findings) -> Any:
+def _read(kind: Any, text: str, location: str, findings: Findings) -> Any:
     """Return a JSON text as a type; None where a field is wrong, and all that are are problems."""
     before = findings.count
     result = None
-    with findings.reading(where):
+    with findings.reading(location):
         value = parse_json(text)
         try:
             result = _reader(kind).validate_json(text)
         except ValidationError as problem:
             for error in problem.errors(include_url=False):
-                findings.refuse(where, _path(error["loc"]), _message(error))
+                findings.refuse(location, _path(error["loc"]), _message(error))
         if isinstance(value, dict):
             value.pop("per_trajectory", None)  # numbers alone, and many
         for path, wrong in unsafe(value):
-            findings.refuse(where, path, wrong)
+            findings.refuse(location, path, wrong)
     return None if findings.count > before else result
 
 
@@ -256,12 +256,12 @@ def _message(error: Any) -> str:
     return f"is {short(error['input'])}: {error['msg'].replace('Input should be', 'expected')}"
 
 
-def _hold_to(rules: Mapping[str, Rule], value: Any, where: str, findings: Findings) -> bool:
+def _hold_to(rules: Mapping[str, Rule], value: Any, location: str, findings: Findings) -> bool:
     """Tell whether fields keep their rules; each that does not is a problem."""
     wrong = {field: complaint(rule, getattr(value, field)) for field, rule in rules.items()}
     for field, message in wrong.items():
         if message:
-            findings.refuse(where, field, message)
+            findings.refuse(location, field, message)
     return not any(wrong.values())
 
 
@@ -285,16 +285,16 @@ def read_records(contents: Mapping[str, bytes], findings: Findings) -> dict[str,
         return {}
     records = {}
     for number, line in enumerate(lines, start=1):
-        where = f"{name}:{number}"
+        location = f"{name}:{number}"
         if len(line) > MOST_LINE or not line.isprintable():
             expected = f"one record in plain JSON of at most {MOST_LINE} characters"
-            findings.refuse(where, "", f"is {short(line)}, expected {expected}")
+            findings.refuse(location, "", f"is {short(line)}, expected {expected}")
             continue
-        record = _read(Record, line, where, findings)
+        record = _read(Record, line, location, findings)
         if record is None:
             continue
         rules = {**_RECORD, **(_PAIRED if record.paired else _UNPAIRED)}
-        if _hold_to(rules, record, where, findings):
-            record = Record.from_json(line, where)
-            records[f"{where} ({record.cell})"] = record
+        if _hold_to(rules, record, location, findings):
+            record = Record.from_json(line, location)
+            records[f"{location} ({record.cell})"] = record
     return records

@@ -105,25 +105,25 @@ def check_together(
     """
     seen: dict[Any, str] = {}
     positions: dict[str, set[Position]] = defaultdict(set)
-    for where, record in records.items():
+    for location, record in records.items():
         for field in ("split", "split_digest", "protocol"):
             expected = getattr(entry, field)
-            findings.expect(where, field, expected, getattr(record, field), "that of the entry")
-        if (first := seen.setdefault(record.cell, where)) != where:
-            findings.refuse(where, "cell", f"is there twice: it is that of {first} too")
+            findings.expect(location, field, expected, getattr(record, field), "that of the entry")
+        if (first := seen.setdefault(record.cell, location)) != location:
+            findings.refuse(location, "cell", f"is there twice: it is that of {first} too")
         if cells and record.position not in cells:
             field = "anomaly" if record.environment in dict(cells) else "environment"
             cell = short("/".join(record.position))
-            findings.refuse(where, field, f"{cell} is no cell of split {entry.split}")
+            findings.refuse(location, field, f"{cell} is no cell of split {entry.split}")
         positions[record.cell.label].add(record.position)
     if (rows := len({record.setting for record in records.values()})) > MOST_ROWS:
         findings.refuse(RECORDS, "rows", f"are {rows}, expected at most {MOST_ROWS} of one entry")
-    known = set(cells) or set().union(*positions.values())
-    environments = {environment for environment, _ in known}
+    all_cells = set(cells) or set().union(*positions.values())
+    environments = {environment for environment, _ in all_cells}
     for label, present in positions.items():
         evaluated = {environment for environment, _ in present}
         for environment in sorted(evaluated):
-            if lacking := sorted(c for e, c in known - present if e == environment):
+            if lacking := sorted(c for e, c in all_cells - present if e == environment):
                 why = "an environment counts with all; run them, or leave out what is not complete"
                 message = f"{environment} lacks {', '.join(lacking)}: {why}"
                 findings.refuse(f"records of {label}", "anomaly", message)
