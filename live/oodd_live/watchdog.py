@@ -182,35 +182,22 @@ class Watchdog:
         data = NominalData.of(
             train, calibration, sensors=sensors, offsets=offsets, baseline=baseline, rate=rate
         )
-        nominal, rate = data.nominal, data.rate
+        nominal = data.nominal
         rows = nominal.baseline.rows if nominal.baseline else 0
         handle = DetectorHandle.make(detector, statistic, seed, horizon, parameters or {}, rows)
-        if hours is not None and not (hours > 0 and rate):
-            raise UsageError(
-                f"hours={hours!r} and rate={rate!r}: a mean time between false alarms needs both, "
-                "in hours and in observations per second, above 0"
-            )
-        if hours is not None and confidence is not None:
-            raise UsageError(
-                f"hours={hours!r} and confidence={confidence!r}: a confidence is of a share of "
-                "episodes, alpha; a mean time between false alarms has its interval, `run_length`"
-            )
+        settings = Settings(alpha, confidence, data.rate, latch, hold_off)
+        if hours is not None:
+            _check_hours(hours, settings)
         if not margin >= 0:
             raise UsageError(f"margin={margin!r}, expected a share of a range, 0 or more")
-        if not (0 < alpha < 1 and (confidence is None or 0 < confidence < 1)):
-            expected = "shares between 0 and 1"
-            raise UsageError(f"alpha={alpha!r}, confidence={confidence!r}: expected {expected}")
         training, calibrating = data.train, data.calibration
-        least = least_episodes(alpha, handle.alarm, confidence) if hours is None else 1
-        if len(calibrating) < least:
-            subject = f"alpha={alpha!r}"
-            raise UsageError(too_few(subject, len(calibrating), alpha, handle.alarm, confidence))
+        _check_shares(settings)
+        _check_enough(len(calibrating), settings, handle.alarm, hours)
         handle.detector.fit([handle.visible(x, nominal.baseline) for x in training])
         # Without a guarantee to keep exact, the limits may know what the threshold is from.
         limit_episodes = training if hours is None else training + calibrating
         limits = StreamLimits.fit(limit_episodes, map(nominal.judged, limit_episodes), margin)
         scores = [handle.scores(x, nominal.baseline) for x in calibrating]
-        settings = Settings(alpha, confidence, rate, latch, hold_off)
         findings = data.findings()
         notes = [finding.text for finding in findings]
         for finding in findings:
@@ -223,14 +210,7 @@ class Watchdog:
             if any(faults):
                 notes.append(_faults_note(faults, nominal.sensors))
             return cls(handle, fitted, rule, limits, nominal, settings, None, notes)
-        standardization = Standardization.fit(scores) if handle.alarm == "cusum" else None
-        unbounded = GuaranteedAlarm(standardization, math.inf)
-        # One after the other: what a sum has reached at the end of one goes on in the next.
-        joined = unbounded.statistic(np.concatenate(scores))
-        ends = np.cumsum([len(s) for s in scores])
-        largest = np.array([part.max() for part in np.split(joined, ends[:-1])])
-        threshold, run_length = RunLength.fit(largest, int(ends[-1]), hours, float(rate or 0))
-        rule = replace(unbounded, threshold=threshold)
+        rule, run_length = _with_run_length(scores, handle.alarm, hours, settings.rate or 0.0)
         return cls(handle, None, rule, limits, nominal, settings, run_length, notes)
 
     @property
@@ -626,6 +606,36 @@ def _finite(value: float) -> float:
     return float(value)
 
 
+def _check_hours(hours: float, settings: Settings) -> None:
+    """Raise `UsageError` unless a mean time between false alarms can be promised."""
+    if not (hours > 0 and settings.rate):
+        raise UsageError(
+            f"hours={hours!r} and rate={settings.rate!r}: a mean time between false alarms needs "
+            "both, in hours and in observations per second, above 0"
+        )
+    if settings.confidence is not None:
+        raise UsageError(
+            f"hours={hours!r} and confidence={settings.confidence!r}: a confidence is of a share "
+            "of episodes, alpha; a mean time between false alarms has its interval, `run_length`"
+        )
+
+
+def _check_shares(settings: Settings) -> None:
+    """Raise `UsageError` unless alpha and confidence are shares."""
+    alpha, confidence = settings.alpha, settings.confidence
+    if not (0 < alpha < 1 and (confidence is None or 0 < confidence < 1)):
+        expected = "shares between 0 and 1"
+        raise UsageError(f"alpha={alpha!r}, confidence={confidence!r}: expected {expected}")
+
+
+def _check_enough(episodes: int, settings: Settings, kind: AlarmKind, hours: float | None) -> None:
+    """Raise `UsageError` when there are too few calibration episodes for the promise."""
+    alpha, confidence = settings.alpha, settings.confidence
+    least = least_episodes(alpha, kind, confidence) if hours is None else 1
+    if episodes < least:
+        raise UsageError(too_few(f"alpha={alpha!r}", episodes, alpha, kind, confidence))
+
+
 _Faults: TypeAlias = Mapping[int | str, StreamFault]
 
 
@@ -654,6 +664,20 @@ def _guaranteed(
             "promise less"
         )
     return calibration.rule(settings.alpha, settings.confidence)
+
+
+def _with_run_length(
+    scores: Sequence[Floats], kind: AlarmKind, hours: float, rate: float
+) -> tuple[GuaranteedAlarm, RunLength]:
+    """Return the alarm that is false once in so many hours on average, and its run length."""
+    standardization = Standardization.fit(scores) if kind == "cusum" else None
+    unbounded = GuaranteedAlarm(standardization, math.inf)
+    # One after the other: what a sum has reached at the end of one goes on in the next.
+    joined = unbounded.statistic(np.concatenate(scores))
+    ends = np.cumsum([len(s) for s in scores])
+    largest = np.array([part.max() for part in np.split(joined, ends[:-1])])
+    threshold, run_length = RunLength.fit(largest, int(ends[-1]), hours, float(rate))
+    return replace(unbounded, threshold=threshold), run_length
 
 
 def _faults_note(faults: Sequence[_Faults], sensors: Sequence[str]) -> str:
