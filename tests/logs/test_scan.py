@@ -3,6 +3,7 @@
 import json
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -15,7 +16,7 @@ from oodd_logs.episodes import EVERY, Episode, read_every_episode
 from oodd_logs.recipe import Recipe
 from oodd_logs.scanning.logs import read_logs
 from oodd_logs.scanning.outliers import LEAST, Tail, critical_p, q_values, rank_p, rank_threshold
-from oodd_logs.scanning.scan_page import PICTURES, page
+from oodd_logs.scanning.scan_page import PICTURES, page, picture
 from oodd_logs.scanning.viewers import write_mcap, write_rerun
 
 from oodd_eval.cli.main import main
@@ -530,6 +531,14 @@ def test_pictures_are_bounded(scan):
     long = [episode(x, f"e{i}") for i, x in enumerate(logs(n=9, rows=12_000))]
     long[2].observations[9_000:, 1] += 40
     assert len(page(scan_episodes(long, detector="mahalanobis"))) < 100_000
+
+
+def test_only_a_logarithmic_statistic_has_powers_of_ten_on_its_axis(scan):
+    strong = replace(scan.odd[0], largest=1e6, statistic=np.linspace(0.1, 1e6, 150), threshold=10.0)
+    drawn = picture(strong, ["logged speed", *SENSORS[1:]])
+    assert drawn == picture(strong, SENSORS).replace("speed", "logged speed")
+    assert "statistic (log)" in drawn
+    assert ">1e+06</text>" in drawn
 
 
 @pytest.mark.browser

@@ -171,10 +171,11 @@ def picture(one: ScannedEpisode, names: Sequence[str]) -> str:
     around = range(max(0, first - AROUND), min(rows, first + AROUND + 1))
     statistic = np.where(np.isfinite(one.statistic), one.statistic, np.nan)
     title, limit = "statistic", one.threshold
-    if 0 < limit * LOGARITHMIC < one.largest < math.inf:
+    logarithmic = 0 < limit * LOGARITHMIC < one.largest < math.inf
+    if logarithmic:
         statistic = np.log10(np.maximum(statistic, limit / 1e3))
         title, limit = "statistic (log)", math.log10(limit)
-    panels = [_panel(statistic, title, 0, _TALL, range(rows), one, limit)]
+    panels = [_panel(statistic, title, 0, _TALL, range(rows), one, limit, logarithmic=logarithmic)]
     height = _TALL + _GAP
     for name in list(dict.fromkeys(suspects))[:SENSORS]:
         panels.append(_panel(columns[name], name, height, _LOW, around, one))
@@ -201,6 +202,8 @@ def _panel(
     rows: range,
     one: ScannedEpisode,
     limit: float = math.nan,
+    *,
+    logarithmic: bool = False,
 ) -> str:
     """Return a curve of some rows in its frame, with limit and odd rows."""
     top, begin, end = top + 18, rows.start, rows.stop
@@ -235,7 +238,7 @@ def _panel(
         points = " ".join(f"{x(begin + r):.1f},{y(v):.1f}" for r, v in _thinned(visible, *run))
         parts.append(_tag("polyline", class_="curve", points=points))
     for line, value in ((top + 12, high), (bottom - 4, low)):
-        parts.append(text(_LEFT - 6, line, figure(10**value if "log" in name else value)))
+        parts.append(text(_LEFT - 6, line, figure(10**value if logarithmic else value)))
     parts.append(_tag("text", html.escape(name), class_="name", x=_LEFT, y=top - 5))
     if is_limited:
         parts.append(text(right, top - 5, f"dashed: threshold {figure(one.threshold)}"))
