@@ -707,7 +707,7 @@ def _in_parts(reading: _Reading) -> EpisodeSource:
     parts = _shared_out(reading)
     for part in (part for part in (TRAIN, CALIBRATION) if not parts[part]):
         why = f"[nominal] names no file with one for {part}"
-        if left_out := [counted(n, what) for what, n in reading.tally.left_out.items() if n]:
+        if left_out := [counted(n, noun) for noun, n in reading.tally.left_out.items() if n]:
             why = f"left out are {', '.join(left_out)}"
         if count := len(reading.parts.get(FILES, ())):
             why = f"the nominal files make {count}; a window cuts long recordings into several"

@@ -174,8 +174,8 @@ def import_data(
         )
     check_known(f"anomaly in {test}", kinds, *(groups or {}))
     check_known("group", GROUPS, *(groups or {}).values())
-    known = {kind: ANOMALIES[kind].group for kind in kinds if kind in ANOMALIES}
-    group_of = known | cast("dict[str, Group]", dict(groups or {}))
+    default_groups = {kind: ANOMALIES[kind].group for kind in kinds if kind in ANOMALIES}
+    group_of = default_groups | cast("dict[str, Group]", dict(groups or {}))
     anomalous = {
         kind: AnomalousFiles(files=files[kind], group=group_of.get(kind, "dynamics"))
         for kind in in_order(kinds, ANOMALIES)
@@ -201,8 +201,8 @@ def _files_of(form: str, part: Path) -> tuple[str, ...]:
         return (_escaped(part),)
     files = [p for p in part.iterdir() if p.is_file() and reader.fits(p) and _is_log(p)]
     if not files:
-        what = " or ".join(f"*{suffix}" for suffix in reader.suffixes) or reader.part
-        raise UsageError(f"{str(part)!r} has no files {what}, expected one an episode")
+        file_kind = " or ".join(f"*{suffix}" for suffix in reader.suffixes) or reader.part
+        raise UsageError(f"{str(part)!r} has no files {file_kind}, expected one an episode")
     return tuple(map(_escaped, files))
 
 
@@ -252,10 +252,10 @@ def _with_names(recipe: Recipe, sensors: Sequence[Quantity], actions: Sequence[Q
     recording = next(reader_for(path, recipe.format).read(path, recipe.options), None)
     if recording is None:
         raise UsageError(f"{path} has no episodes, expected at least one")
-    chosen = select_columns(layout_of(recording), recipe, recording.source)
+    selection = select_columns(layout_of(recording), recipe, recording.source)
     names: dict[str, Any] = {}
     for kind, quantities in (("sensors", sensors), ("actions", actions)):
-        columns = getattr(chosen, kind)
+        columns = getattr(selection, kind)
         named = [quantity.name for quantity in quantities]
         choices = recipe.discrete or recording.fields.get("discrete", 0)
         discrete = kind == "actions" and bool(named and choices)
@@ -270,7 +270,7 @@ def _with_names(recipe: Recipe, sensors: Sequence[Quantity], actions: Sequence[Q
         is_new = quantities and not discrete
         pairs = zip(quantities if is_new else [c.quantity for c in columns], columns, strict=True)
         names[kind] = tuple(f"{q.name}[{q.unit}]={c.column}" for q, c in pairs)
-    reward = chosen.reward.column if chosen.reward else ""
+    reward = selection.reward.column if selection.reward else ""
     return dataclasses.replace(recipe, **names, reward=reward)
 
 

@@ -65,8 +65,8 @@ def anomalous_cells(values: Column, recipe: Recipe, *, before: bool) -> NDArray[
     nominal = recipe.nominal_label
     if values.dtype.kind == "U":
         texts = {str(v).strip().lower() for v in nominal} if nominal else {*NOMINAL_LABELS}
-        known, codes = np.unique(values, return_inverse=True)
-        wrong = np.array([text.strip().lower() not in texts for text in known.tolist()], bool)
+        labels, codes = np.unique(values, return_inverse=True)
+        wrong = np.array([text.strip().lower() not in texts for text in labels.tolist()], bool)
         return np.asarray(wrong[codes], bool)
     numbers = [float(v) for v in nominal if isinstance(v, int | float)] if nominal else [0.0]
     present = np.where(np.isnan(values), -1, np.arange(len(values)))
@@ -95,8 +95,8 @@ def rows_of(
         start = int(np.searchsorted(positions, mark.start - tolerance))
         stop = max(int(np.searchsorted(positions, mark.stop - tolerance)), start + 1)
         if start < len(positions):
-            known = -1 if math.isinf(mark.start) else start
-            rows.append((known, min(stop, len(positions)), mark.kind))
+            marked_start = -1 if math.isinf(mark.start) else start
+            rows.append((marked_start, min(stop, len(positions)), mark.kind))
     return sorted(rows)
 
 

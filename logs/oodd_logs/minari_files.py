@@ -99,13 +99,13 @@ def _write(
             for i, trajectory in enumerate(trajectories):
                 group = stored.create_group(f"episode_{i}")
                 _episode(group, i, trajectories, trajectory, data.discrete, ended[i])
-        what, further = f"nominal, {trajectories.group}", ""
+        content, further = f"nominal, {trajectories.group}", ""
         anomalies = f"{trajectories.group.removeprefix('test/')} anomalies"
         if isinstance(trajectories, AnomalousSet):
-            what = f"{anomalies} from an onset on"
+            content = f"{anomalies} from an onset on"
             further = ", anomaly, onset, effect, redraws, parameters as JSON"
         elif isinstance(trajectories, LabelledSet):
-            what = f"{anomalies} in intervals of rows"
+            content = f"{anomalies} in intervals of rows"
             further = ", anomaly, intervals as JSON (a start of -1 is unknown, none: outcome alone)"
         source = f"trajectories of a fixed policy ({policy}), from"
         if data.logs:
@@ -128,7 +128,7 @@ def _write(
             "action_space": json.dumps(action),
             "algorithm_name": policy,
             "author": ["The oodd-eval developers"],
-            "description": f"{title_of(data.id)}, {what}: {source} split {split.name} of "
+            "description": f"{title_of(data.id)}, {content}: {source} split {split.name} of "
             f"oodd-eval. Episode metadata: seed{further}.",
             "oodd_eval_version": __version__,
             "split_digest": split.digest,

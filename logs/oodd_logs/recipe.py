@@ -123,11 +123,11 @@ def _choice(*names: str) -> Callable[[str, Any], str]:
 
 def _scalars(key: str, value: Any) -> tuple[Any, ...]:
     values = value if isinstance(value, list | tuple) else [value]
-    return tuple(_scalar(key, one) for one in values)
+    return tuple(_scalar(key, element) for element in values)
 
 
 def _conditions(key: str, value: Any) -> dict[str, tuple[Any, ...]]:
-    return {name: _scalars(f"{key}.{name}", one) for name, one in _table(key, value).items()}
+    return {name: _scalars(f"{key}.{name}", values) for name, values in _table(key, value).items()}
 
 
 def _discrete(key: str, value: Any) -> int | tuple[str, ...]:

@@ -93,8 +93,8 @@ class Recorded:
         layout = layout_of(self.recording)
         columns = find_columns(layout, name)
         if not columns:
-            known = [*fields, *named_columns(layout)]
-            raise UnknownNameError(f"field or column of {self.source}", name, known)
+            available = [*fields, *named_columns(layout)]
+            raise UnknownNameError(f"field or column of {self.source}", name, available)
         topic, column = self.recording.topics[columns[0].topic], columns[0].column
         if last:
             cells = topic.read([column], topic.rows - 1, topic.rows)[column]
@@ -221,9 +221,9 @@ class StampedRows:
             inside = {n: (times >= first) & (times <= last) for n, times in timed.items()}
             left_out -= sum(int(rows.sum()) for rows in inside.values())
             if recipe.rate is None:
-                ((name, chosen),) = inside.items()
-                rows = usable[name][chosen]
-                stretches.append(Stretch(len(rows), {name: rows}, timed[name][chosen]))
+                ((name, mask),) = inside.items()
+                rows = usable[name][mask]
+                stretches.append(Stretch(len(rows), {name: rows}, timed[name][mask]))
             else:
                 stretch = on_grid(timed, first, last, recipe.rate, source)
                 sources = {n: usable[n][numbers] for n, numbers in stretch.sources.items()}

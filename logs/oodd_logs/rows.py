@@ -126,9 +126,9 @@ class TopicRows:
             return np.arange(self._count)
         kept = np.flatnonzero(complete)
         if lacking or (self._policy == "drop" and not len(kept)):
-            what = f"column {lacking[0]!r} has no value" if lacking else "no row has all values"
+            problem = f"column {lacking[0]!r} has no value" if lacking else "no row has all values"
             raise TrajectoryError(
-                f"{self._source}: {what}, expected some: leave the column or the file out"
+                f"{self._source}: {problem}, expected some: leave the column or the file out"
             )
         if self._policy != "drop":
             first = self._position = int(firsts.max(initial=0))
@@ -199,9 +199,9 @@ class TopicRows:
         self._tally.add("rows with missing values held", count, self._source)
 
     def _too_long(self, row: int, column: str, rows: int) -> TrajectoryError:
-        what = f"column {column!r} is missing" if column else "values are missing"
+        problem = f"column {column!r} is missing" if column else "values are missing"
         return TrajectoryError(
-            f"{self._source}, row {row}: {what} for at least {rows} rows, expected at most "
+            f"{self._source}, row {row}: {problem} for at least {rows} rows, expected at most "
             f"{self._most} in a run: a larger missing_rows allows it, else leave the column or the "
             "file out"
         )

@@ -185,22 +185,22 @@ def _by_prefix(
     layout: Layout, source: str, *, explicit: bool
 ) -> tuple[list[ChosenColumn], list[ChosenColumn], list[ChosenColumn]]:
     """Return the columns ``obs:NAME[UNIT]``, ``action:NAME[UNIT]`` and ``reward``."""
-    chosen: dict[str, list[ChosenColumn]] = {"obs": [], "action": [], "reward": []}
+    by_kind: dict[str, list[ChosenColumn]] = {"obs": [], "action": [], "reward": []}
     for topic, columns, _ in layout:
         for name in columns:
             match = _PREFIX.match(name)
             kind = match[1].lower() if match else name.strip().lower()
             if match or kind == "reward":
                 label, unit = _named_unit(name[match.end() :] if match else name)
-                chosen[kind].append(ChosenColumn(topic, name, Quantity(label, unit or "1")))
-    if not chosen["obs"]:
+                by_kind[kind].append(ChosenColumn(topic, name, Quantity(label, unit or "1")))
+    if not by_kind["obs"]:
         _check_spelling(source, [name for _, columns, _ in layout for name in columns])
         names = ", ".join(named_columns(layout))
         raise UsageError(
             f"{source} has the columns {names or 'none'}: none is called "
             "obs:NAME[UNIT], so name the sensors in a recipe (sensors = [...]), actions, too"
         )
-    return chosen["obs"], [] if explicit else chosen["action"], chosen["reward"]
+    return by_kind["obs"], [] if explicit else by_kind["action"], by_kind["reward"]
 
 
 def _check_spelling(source: str, names: Iterable[str]) -> None:
@@ -214,15 +214,15 @@ def _check_spelling(source: str, names: Iterable[str]) -> None:
 
 def _listed(layout: Layout, texts: Sequence[str], source: str) -> list[ChosenColumn]:
     """Return the columns that texts name, each once."""
-    chosen: dict[tuple[str, str], ChosenColumn] = {}
+    selected: dict[tuple[str, str], ChosenColumn] = {}
     for text in texts:
         columns = find_columns(layout, text)
         if not columns:
             name = split_unit(text.rpartition("=")[2])[0]
             raise UnknownNameError(f"column of {source}", name, named_columns(layout))
         for column in columns:
-            chosen.setdefault((column.topic, column.column), column)
-    return list(chosen.values())
+            selected.setdefault((column.topic, column.column), column)
+    return list(selected.values())
 
 
 def _times(
@@ -239,10 +239,10 @@ def _times(
     }
     if text and not columns:
         raise UnknownNameError(f"column of {source}", split_unit(text)[0], named_columns(layout))
-    chosen = defined | columns
-    if text and (without := [topic for topic in topics if topic not in chosen]):
+    time_columns = defined | columns
+    if text and (without := [topic for topic in topics if topic not in time_columns]):
         raise TrajectoryError(f"{source}: topic {without[0]!r} has no column {text!r}, its stamps")
-    return {topic: chosen[topic] for topic in topics if topic in chosen}
+    return {topic: time_columns[topic] for topic in topics if topic in time_columns}
 
 
 def _named_unit(text: str) -> tuple[str, str]:
@@ -262,10 +262,10 @@ def _aliases(topic: str, column: str) -> list[str]:
 
 def _matches(layout: Layout, text: str) -> list[ChosenColumn]:
     """Return the columns that a glob without a new name matches, with the unit it names."""
-    whole = text.strip()
-    readings = dict.fromkeys([(whole, ""), split_unit(whole), _named_unit(whole)])
-    if {*whole} & {*"*?"}:  # columns with the unit and without it
-        readings = dict.fromkeys([split_unit(whole), (whole, ""), _named_unit(whole)])
+    stripped = text.strip()
+    readings = dict.fromkeys([(stripped, ""), split_unit(stripped), _named_unit(stripped)])
+    if {*stripped} & {*"*?"}:  # columns with the unit and without it
+        readings = dict.fromkeys([split_unit(stripped), (stripped, ""), _named_unit(stripped)])
     for pattern, unit in readings:
         glob = _glob(pattern)
         columns = [
@@ -281,12 +281,13 @@ def _matches(layout: Layout, text: str) -> list[ChosenColumn]:
 
 def _with_unit(topic: str, column: str, unit: str) -> ChosenColumn:
     name = _aliases(topic, column)[-1]
-    known = (_named_unit if _PREFIX.match(column) else split_unit)(column)[1]
-    if unit not in {"", known} and known not in {"", "1"}:
+    recorded_unit = (_named_unit if _PREFIX.match(column) else split_unit)(column)[1]
+    if unit not in {"", recorded_unit} and recorded_unit not in {"", "1"}:
         raise UsageError(
-            f"column {column!r} is in {known}, and the recipe says {unit}: values are not converted"
+            f"column {column!r} is in {recorded_unit}, and the recipe says {unit}: values are not "
+            "converted"
         )
-    return ChosenColumn(topic, column, Quantity(name, unit or known or "1"))
+    return ChosenColumn(topic, column, Quantity(name, unit or recorded_unit or "1"))
 
 
 def matches_any(patterns: Iterable[str], names: Sequence[str], kind: str = "") -> bool:

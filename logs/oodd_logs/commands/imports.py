@@ -72,12 +72,12 @@ def import_logs(options: Options) -> int:
         "progress": lambda part: notes.print(f"writing {part}"),
         "report": lambda line: print_prose(line, console),
     }
-    chosen = {name: value for name in _SHORT if (value := getattr(options, name))}
-    shipped = None if chosen else shipped_recipes().get(options.name)
+    keys = {name: value for name in _SHORT if (value := getattr(options, name))}
+    shipped = None if keys else shipped_recipes().get(options.name)
     if options.name.endswith(".toml") or shipped:
-        if chosen:
+        if keys:
             raise UsageError(
-                f"--{next(iter(chosen))} is said by the recipe {options.name}: write it there"
+                f"--{next(iter(keys))} is said by the recipe {options.name}: write it there"
             )
         if shipped and not options.root:
             raise UsageError(f"--root is missing: the folder with the files of {options.name}")
@@ -86,7 +86,7 @@ def import_logs(options: Options) -> int:
         environment = recipe.environment
         split = import_recipe(recipe, options.root or path.parent, **say)
     else:
-        if lacking := [name for name in _REQUIRED if name not in chosen]:
+        if lacking := [name for name in _REQUIRED if name not in keys]:
             raise UsageError(
                 f"{options.name!r} is no recipe (FILE.toml, or {', '.join(shipped_recipes())}), "
                 f"and --{lacking[0]} is missing: expected "
@@ -94,9 +94,9 @@ def import_logs(options: Options) -> int:
             )
         if options.root:
             raise UsageError("--root is the folder of a recipe's files, expected FILE.toml with it")
-        environment, form = chosen.pop("env"), chosen.pop("format")
-        groups = dict(chosen.pop("group", ()))
-        split = import_data(options.name, environment, form=form, groups=groups, **chosen, **say)
+        environment, form = keys.pop("env"), keys.pop("format")
+        groups = dict(keys.pop("group", ()))
+        split = import_data(options.name, environment, form=form, groups=groups, **keys, **say)
     console.print(f"split {split.name}, digest {split.digest[:12]}, in {split.path}")
     with split.opened() as opened:
         data = opened(environment)

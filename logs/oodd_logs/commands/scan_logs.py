@@ -109,23 +109,27 @@ def _print(result: Scan, notes: Sequence[str], options: Options) -> None:
         # The oddest first: of many, odd ones and the next to these.
         listed = sorted(
             result.episodes,
-            key=lambda one: (not one.odd, math.inf if math.isnan(one.p) else one.p, -one.largest),
+            key=lambda scanned: (
+                not scanned.odd,
+                math.inf if math.isnan(scanned.p) else scanned.p,
+                -scanned.largest,
+            ),
         )
         if options.verbosity == 0 and len(listed) > _MANY:
             listed = listed[: len(result.odd) + _NEXT]
         heads = titles(listed)
         # Names may have line breaks.
         lines = [
-            [" ".join(cell.split()) for cell in cells(one, brief=True)[: len(heads)]]
-            for one in listed
+            [" ".join(cell.split()) for cell in cells(scanned, brief=True)[: len(heads)]]
+            for scanned in listed
         ]
         kept = [i for i in range(len(heads)) if i < _ALWAYS or any(line[i] for line in lines)]
         align = ["left", *("right" if heads[i] in NUMBERS else "left" for i in kept)]
-        marks = ["odd" * one.odd for one in listed]
+        marks = ["odd" * scanned.odd for scanned in listed]
         rows = [[mark, *(line[i] for i in kept)] for mark, line in zip(marks, lines, strict=True)]
         head = ["", *(heads[i] for i in kept)]
         table = tabulate(rows, head, "simple", disable_numparse=True, colalign=align)
-        colours = ["", "", *("bold red" * one.odd for one in listed)]
+        colours = ["", "", *("bold red" * scanned.odd for scanned in listed)]
         for line, colour in zip(table.splitlines(), colours, strict=True):
             console.print(Text(line.rstrip(), colour))
         console.print("")
@@ -141,19 +145,20 @@ def _print(result: Scan, notes: Sequence[str], options: Options) -> None:
 
 def _on_labels(result: Scan, *, fitted: bool) -> Iterator[str]:
     """Yield what became of episodes that the logs call anomalous, and whether they are many."""
-    labelled = [one for one in result.episodes if one.label]
+    labelled = [scanned for scanned in result.episodes if scanned.label]
     if not labelled:
         return
-    missed = [one for one in labelled if not one.odd]
+    missed = [scanned for scanned in labelled if not scanned.odd]
     anomalous = counted(len(labelled), "episode(s)")
     yield (
         f"Anomalous by their labels: {anomalous}, {len(labelled) - len(missed)} of them odd here."
     )
-    others = [one.largest for one in result.episodes if not one.label]
-    limits = [one.threshold for one in missed if math.isfinite(one.threshold)]
-    if not (fitted and limits and others):
+    largest_unlabelled = [scanned.largest for scanned in result.episodes if not scanned.label]
+    limits = [scanned.threshold for scanned in missed if math.isfinite(scanned.threshold)]
+    if not (fitted and limits and largest_unlabelled):
         return
-    usual, anomalies = np.median(others), np.median([one.largest for one in labelled])
+    usual = np.median(largest_unlabelled)
+    anomalies = np.median([scanned.largest for scanned in labelled])
     yield (
         f"The largest statistic of these is {figure(anomalies)} in the median, that of the others "
         f"{figure(usual)}; an episode is odd from about {figure(np.median(limits))} on, as a scan "

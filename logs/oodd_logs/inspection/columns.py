@@ -214,8 +214,8 @@ class ClockFacts:
         times = np.concatenate([np.zeros(0), *(stamps for _, stamps in present)])
         if len(times) < 2:
             return None
-        steps, whole = Steps.of(times, rows), bool((times == np.round(times)).all())
-        return cls(steps, dated, float(np.abs(times).max()), whole)
+        steps, all_whole = Steps.of(times, rows), bool((times == np.round(times)).all())
+        return cls(steps, dated, float(np.abs(times).max()), all_whole)
 
 
 def time_unit(name: str, clocks: Sequence[ClockFacts]) -> str:

@@ -118,9 +118,9 @@ def _draft_rows(logs: Inspection) -> Iterator[str]:
     times = logs.times
     if len(times) == 1 and len(logs.topics) == 1:
         ((name, unit),) = times.items()
-        known = "" if unit in {"date", "s"} or "[" in name else f"[{unit}]"
+        suffix = "" if unit in {"date", "s"} or "[" in name else f"[{unit}]"
         if name not in logs.stamps:
-            yield f"time = {toml(f'{name}{known}')}"
+            yield f"time = {toml(f'{name}{suffix}')}"
     if times:
         yield f"rate = {rate_of(logs)}  # rows in a second"
     else:
@@ -175,8 +175,8 @@ def _draft_labels(logs: Inspection) -> Iterator[str]:
     if logs.intervals:
         yield f"intervals = {toml(logs.intervals)}"
     elif logs.labels:
-        label, *others = logs.labels
-        also = f"  # or {listed(others)}" if others else ""
+        label, *alternatives = logs.labels
+        also = f"  # or {listed(alternatives)}" if alternatives else ""
         yield f"labels = {toml(label)}{also}"
         values = nominal_values(logs, label)
         if values not in {(0.0,), ("H",)}:
@@ -193,8 +193,8 @@ def _draft_files(logs: Inspection, prefix: str) -> Iterator[str]:
     """Yield the tables that say which files are nominal, and which have which anomaly."""
     sorting = sort_files(logs)
     files = list(dict.fromkeys(r.file for r in logs.recordings))
-    if others := [file for file in files if file not in usable_files(logs)]:
-        yield f"# left out, as copies of others or with other columns: {listed(others, 40)}"
+    if unusable := [file for file in files if file not in usable_files(logs)]:
+        yield f"# left out, as copies of others or with other columns: {listed(unusable, 40)}"
     if logs.unreadable:
         yield f"# left out, as they cannot be read: {listed(logs.unreadable, 40)}"
         files = list(dict.fromkeys([*files, *logs.unreadable]))

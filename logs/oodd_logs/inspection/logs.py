@@ -146,15 +146,15 @@ class Inspection:
 
         Of those that may be, the one that falls least; none where a hundredth of its steps fall.
         """
-        chosen: dict[str, str] = {}
+        time_columns: dict[str, str] = {}
         best: dict[str, float] = {}
         for name in dict.fromkeys(c for r in self.recordings for c in r.clocks):
             topic, facts = self.topic_of(name), self.columns[name]
             stuck = sum(c.steps.falls + c.steps.repeats for _, c in self.clocks(name))
             share = stuck / max(1, facts.cells)
             if share < min(0.01, best.get(topic, 1.0)) and facts.missing < facts.cells / 2:
-                chosen[topic], best[topic] = name, share
-        clocks = {name: [clock for _, clock in self.clocks(name)] for name in chosen.values()}
+                time_columns[topic], best[topic] = name, share
+        clocks = {name: [clock for _, clock in self.clocks(name)] for name in time_columns.values()}
         return {n: "s" if n in self.stamps else time_unit(n, c) for n, c in clocks.items()}
 
     @property
@@ -169,7 +169,7 @@ class Inspection:
         They have few values, whole numbers with many zeros or texts, and a name that says so, or
         are missing from some recordings.
         """
-        chosen = []
+        candidates = []
         for name, facts in self.columns.items():
             values: Mapping[float | str, int] = facts.values or {}
             numbers = [value for value in values if not isinstance(value, str)]
@@ -178,8 +178,8 @@ class Inspection:
             fits = facts.text or (often and all(x == round(x) for x in numbers))
             says_so = _LABEL.search(name.removeprefix(self.topic_of(name)))
             if facts.flag and fits and (partial or says_so):
-                chosen.append((len(values) > 2, facts.missing > 0, not facts.text, name))
-        return tuple(name for *_, name in sorted(chosen, key=lambda row: row[:-1]))
+                candidates.append((len(values) > 2, facts.missing > 0, not facts.text, name))
+        return tuple(name for *_, name in sorted(candidates, key=lambda row: row[:-1]))
 
     def add(self, recording: Recording, file: str) -> None:
         """Read the rows of a recording in blocks and keep what is in them."""
@@ -277,9 +277,9 @@ def inspect_logs(
     TrajectoryError
         When no file can be read.
     """
-    reader, files, others = recognised(path, form)
+    reader, files, other_files = recognised(path, form)
     check_known(f"option of the format {reader.name}", reader.options, *options)
-    result = Inspection(path, reader.name, dict(options), others=others)
+    result = Inspection(path, reader.name, dict(options), others=other_files)
     names = {
         file: file.name if file == path else file.relative_to(path).as_posix() for file in files
     }
@@ -326,14 +326,14 @@ def inspect_logs(
 
 def recognised(path: Path, form: str) -> tuple[Reader, list[Path], Counter[str]]:
     """Return the reader of a path, its files in order, and the number of others by ending."""
-    known = readers()
+    formats = readers()
     if form:
-        check_known("format", known, form)
-        known = {form: known[form]}
+        check_known("format", formats, form)
+        formats = {form: formats[form]}
     if not path.exists():
         raise UsageError(f"{str(path)!r} does not exist, expected a file or folder of logs")
     if path.is_dir():
-        for reader in known.values():
+        for reader in formats.values():
             for candidates in ([path], sorted(filter(Path.is_dir, path.iterdir()))):
                 if sets := [directory for directory in candidates if reader.fits(directory)]:
                     return reader, sets, Counter()
@@ -343,18 +343,18 @@ def recognised(path: Path, form: str) -> tuple[Reader, list[Path], Counter[str]]
         files = sorted(filter(Path.is_file, visible), key=lambda file: in_order(str(file)))
     by_reader: dict[str, list[Path]] = defaultdict(list)
     for file in files:
-        best = max(known.values(), key=lambda reader: reader.fits(file))
+        best = max(formats.values(), key=lambda reader: reader.fits(file))
         if best.fits(file) or (form and path.is_file()):
             by_reader[best.name].append(file)
     if not by_reader:
-        endings = ", ".join(sorted({s for reader in known.values() for s in reader.suffixes}))
+        endings = ", ".join(sorted({s for reader in formats.values() for s in reader.suffixes}))
         raise UsageError(
             f"{str(path)!r} has no files of a known format, expected names that end in {endings}; "
             "--format says which it is"
         )
     name = max(by_reader, key=lambda reader: len(by_reader[reader]))
     left_out = {*files} - {*by_reader[name]}
-    return known[name], by_reader[name], Counter(file.suffix for file in left_out)
+    return formats[name], by_reader[name], Counter(file.suffix for file in left_out)
 
 
 def _continued(recordings: Sequence[RecordingFacts]) -> list[tuple[str, str, int]]:

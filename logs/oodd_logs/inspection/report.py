@@ -154,14 +154,14 @@ def _of_times(logs: Inspection) -> Iterator[Advice]:
         return
     ((name, unit),) = times.items()
     clocks, step = logs.clocks(name), step_of(logs, name)
-    known = "" if unit in {"date", "s"} else f"[{unit}]"
-    keys = [] if name in logs.stamps else [f'time = "{name}{known}"']
+    suffix = "" if unit in {"date", "s"} else f"[{unit}]"
+    keys = [] if name in logs.stamps else [f'time = "{name}{suffix}"']
     keys += [f"rate = {rate}"] if step > 0 else []
     yield _say("time", name=name, unit=_UNITS[unit], step=number(step), keys=", ".join(keys))
     rates = [(r, clock.steps.usual * SCALES[unit]) for r, clock in clocks]
-    if others := [(r.file, other) for r, other in rates if abs(other - step) > 0.1 * step]:
-        steps = listed(sorted({number(other) for _, other in others}))
-        yield _say("rates", files=listed([file for file, _ in others]), steps=steps, rate=rate)
+    if other_rates := [(r.file, other) for r, other in rates if abs(other - step) > 0.1 * step]:
+        steps = listed(sorted({number(other) for _, other in other_rates}))
+        yield _say("rates", files=listed([file for file, _ in other_rates]), steps=steps, rate=rate)
     gaps, falls = cuts_of(logs)
     gap = number(gap_of(logs))
     if gaps:

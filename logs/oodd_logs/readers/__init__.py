@@ -257,16 +257,16 @@ def chosen(names: Iterable[str], options: Options, option: str = "topics") -> li
     UsageError
         When a glob fits none.
     """
-    known, globs = [*names], options.get(option)
+    available, globs = [*names], options.get(option)
     if globs is None:
-        return known
+        return available
     globs = [globs] if isinstance(globs, str) else globs
     if not isinstance(globs, list) or not all(isinstance(glob, str) for glob in globs):
         raise UsageError(f"{option}={globs!r:.80}, expected a list of globs")
     for glob in globs:
-        if not fnmatch.filter(known, glob):
-            raise UnknownNameError(option.removesuffix("s"), glob, known)
-    return [name for name in known if any(fnmatch.fnmatch(name, glob) for glob in globs)]
+        if not fnmatch.filter(available, glob):
+            raise UnknownNameError(option.removesuffix("s"), glob, available)
+    return [name for name in available if any(fnmatch.fnmatch(name, glob) for glob in globs)]
 
 
 def _guarded(topic: Topic, recording: Recording) -> Topic:

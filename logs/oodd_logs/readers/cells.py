@@ -102,10 +102,10 @@ def conventional(name: str) -> str:
     ('obs:flow[l/s]', 'action:u', 'obs_x')
     """
     kind, colon, inner = name.partition(":")
-    known = _KINDS.get(kind.strip().lower())
-    if known == "reward" and not colon:
-        return known
-    return f"{known}:{inner.strip()}" if known in {"obs", "action"} and inner.strip() else name
+    role = _KINDS.get(kind.strip().lower())
+    if role == "reward" and not colon:
+        return role
+    return f"{role}:{inner.strip()}" if role in {"obs", "action"} and inner.strip() else name
 
 
 def nearest_spelling(name: str) -> str:

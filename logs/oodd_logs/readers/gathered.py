@@ -49,8 +49,8 @@ def flat(value: Any, name: str = "", depth: int = 0) -> Iterator[tuple[str, Any]
         names = (f.name for f in dataclasses.fields(value) if not f.name.startswith("__"))
         value = {key: getattr(value, key) for key in names}
     if isinstance(value, Mapping) and {*value} in _STAMPS:
-        whole, part = value.values()
-        value = whole + part / 1e9
+        seconds, nanoseconds = value.values()
+        value = seconds + nanoseconds / 1e9
     prefix = f"{name}." if name else ""
     if isinstance(value, Mapping):
         for key, inner in value.items():

@@ -44,11 +44,11 @@ def _open(directory: Path, _options: Options) -> Iterator[Recording]:
         *directory.glob("episode_*.parquet"),
     ]
     tasks = _lines(info.with_name("tasks.jsonl"), "task_index")
-    known = _lines(info.with_name("episodes.jsonl"), "episode_index")
+    entries = _lines(info.with_name("episodes.jsonl"), "episode_index")
     for path in sorted(files, key=lambda path: in_order(path.stem)):
         rows = ParquetRows(path)
         number = path.stem.removeprefix("episode_")
-        more = known.get(natural(number), {})
+        more = entries.get(natural(number), {})
         yield _episode(path.stem, str(path), rows, (0, rows.rows), facts, tasks, more)
 
 

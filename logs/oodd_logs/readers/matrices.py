@@ -102,21 +102,23 @@ def episode_of(
                 values = np.asarray(array[:] if array.shape else array[()])
                 fields[name] = values.item() if values.size == 1 else values.tolist()
             continue
-        known = {"obs": sensors, "action": actions}.get(kind, ())
+        quantities = {"obs": sensors, "action": actions}.get(kind, ())
         width = array.shape[1] if len(array.shape) == 2 else None
         for i in range(1 if width is None else width):
-            parts[_label(name, kind, i, width, known)] = _Part(name, None if width is None else i)
+            parts[_label(name, kind, i, width, quantities)] = _Part(
+                name, None if width is None else i
+            )
     labels = dict(zip(column_names(parts), parts.values(), strict=True))
 
-    def read(chosen: Sequence[str], start: int, stop: int) -> dict[str, Column]:
+    def read(selected: Sequence[str], start: int, stop: int) -> dict[str, Column]:
         blocks = {}
-        for name in {labels[c].array for c in chosen}:
+        for name in {labels[c].array for c in selected}:
             array = arrays[name]
             size = array.dtype.itemsize * math.prod(array.shape[1:]) * (stop - start)
             EPISODE.check(f"{source}, {name}", array.dtype, size)
             blocks[name] = array[start:stop]
         columns = {}
-        for label in chosen:
+        for label in selected:
             part = labels[label]
             block = blocks[part.array]
             column = np.asarray(block if part.column is None else block[:, part.column], np.float64)
@@ -128,7 +130,7 @@ def episode_of(
     return Topic(tuple(labels), rows, read), fields
 
 
-def _label(name: str, kind: str, i: int, width: int | None, known: Sequence[Quantity]) -> str:
+def _label(name: str, kind: str, i: int, width: int | None, quantities: Sequence[Quantity]) -> str:
     inner = name.partition("/")[2].replace("/", ".")
     if kind == "reward":
         return kind
@@ -137,9 +139,9 @@ def _label(name: str, kind: str, i: int, width: int | None, known: Sequence[Quan
         return plain if width is None else f"{plain}.{i}"
     if inner:
         return f"{kind}:{inner}" if width is None else f"{kind}:{inner}.{i}"
-    if len(known) == (1 if width is None else width):
-        unit = "" if known[i].unit == "1" else f"[{known[i].unit}]"
-        return f"{kind}:{known[i].name}{unit}"
+    if len(quantities) == (1 if width is None else width):
+        unit = "" if quantities[i].unit == "1" else f"[{quantities[i].unit}]"
+        return f"{kind}:{quantities[i].name}{unit}"
     return f"{kind}:{'sensor' if kind == 'obs' else kind} {i}"
 
 

@@ -26,22 +26,22 @@ def _open(path: Path, options: Options) -> Iterator[Recording]:
                 raise EPISODE.failure(f"{path} has a chunk of {chunk.uncompressed_size} bytes")
         selected = chosen(dict.fromkeys(c.topic for c in summary.channels.values()), options)
         decoders: dict[int, Callable[[bytes], Any]] = {}
-        others: dict[str, str] = {}
+        unread: dict[str, str] = {}
         for channel in (c for c in summary.channels.values() if c.topic in selected):
             schema = summary.schemas.get(channel.schema_id)
             with contextlib.redirect_stderr(io.StringIO()):  # it prints what it cannot read
                 decoder = ros2.decoder_for(channel.message_encoding, schema)
             decoder = json.loads if channel.message_encoding == "json" else decoder
             if decoder is None:
-                others[channel.topic] = channel.message_encoding
+                unread[channel.topic] = channel.message_encoding
             else:
                 decoders[channel.id] = decoder
-        if not decoders or ("topics" in options and others):
+        if not decoders or ("topics" in options and unread):
             raise TrajectoryError(
-                f"{path} has {', '.join(f'{t} ({e})' for t, e in others.items()) or 'no channels'}"
+                f"{path} has {', '.join(f'{t} ({e})' for t, e in unread.items()) or 'no channels'}"
                 ", expected channels of JSON, or of ROS 2 with their definitions"
             )
-        readable = [topic for topic in selected if topic not in others]
+        readable = [topic for topic in selected if topic not in unread]
         messages = (
             (channel.topic, message.log_time, decoders[channel.id](message.data))
             for _, channel, message in reader.iter_messages(readable)

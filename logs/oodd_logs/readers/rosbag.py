@@ -20,13 +20,13 @@ def _open(path: Path, options: Options) -> Iterator[Recording]:
     with library(f"rosbags.rosbag{1 + is_ros2}").Reader(path) as bag:
         selected = chosen(dict.fromkeys(c.topic for c in bag.connections), options)
         store = _types(bag.connections)
-        known = {c.topic for c in bag.connections if c.msgtype in store.fielddefs}
-        unknown = [name for name in selected if name not in known]
-        if len(unknown) == len(selected) or ("topics" in options and unknown):
+        defined = {c.topic for c in bag.connections if c.msgtype in store.fielddefs}
+        undefined = [name for name in selected if name not in defined]
+        if len(undefined) == len(selected) or ("topics" in options and undefined):
             raise TrajectoryError(
-                f"{path}: definitions of {', '.join(unknown) or 'any topic'} are missing"
+                f"{path}: definitions of {', '.join(undefined) or 'any topic'} are missing"
             )
-        readable = [name for name in selected if name in known]
+        readable = [name for name in selected if name in defined]
         decode = store.deserialize_cdr if is_ros2 else store.deserialize_ros1
         messages = (
             (connection.topic, stamp, decode(raw, connection.msgtype))

@@ -292,18 +292,20 @@ def _bounded(line: str, path: Path) -> str:
 
 def _encoding(path: Path, options: Options) -> str:
     """Return the encoding that the options or the file's first bytes say."""
-    chosen = options.get("encoding", "utf-8")
+    encoding = options.get("encoding", "utf-8")
     try:
-        codecs.lookup(chosen)
+        codecs.lookup(encoding)
     except (LookupError, TypeError):
-        raise UsageError(f"encoding is {chosen!r}, expected one such as utf-8 or cp1252") from None
+        raise UsageError(
+            f"encoding is {encoding!r}, expected one such as utf-8 or cp1252"
+        ) from None
     with path.open("rb") as file:
         head = file.read(4096)
     if head.startswith((b"\xff\xfe", b"\xfe\xff")):
         return "utf-16"
     if "encoding" not in options and b"\0" in head:
         raise TrajectoryError(f"{path} is no text: there are zero bytes in its first line")
-    return "utf-8-sig" if head.startswith(b"\xef\xbb\xbf") else str(chosen)
+    return "utf-8-sig" if head.startswith(b"\xef\xbb\xbf") else str(encoding)
 
 
 def _split(lines: Sequence[str], separator: str) -> list[list[str]]:
@@ -356,14 +358,18 @@ def _decimal(rows: Sequence[Sequence[str]], separator: str, options: Options) ->
 
 
 def _names(options: Options, names: Sequence[str], count: int, path: Path) -> tuple[str, ...]:
-    chosen = options.get("names")
-    if chosen is None:
+    option_names = options.get("names")
+    if option_names is None:
         return column_names(names)
-    if not isinstance(chosen, list) or not all(isinstance(name, str) for name in chosen):
-        raise UsageError(f"names are {chosen!r}, expected a list of texts")
-    if len(chosen) != count:
-        raise UsageError(f"{path} has {count} columns, expected {len(chosen)} as there are names")
-    return column_names(chosen)
+    if not isinstance(option_names, list) or not all(
+        isinstance(name, str) for name in option_names
+    ):
+        raise UsageError(f"names are {option_names!r}, expected a list of texts")
+    if len(option_names) != count:
+        raise UsageError(
+            f"{path} has {count} columns, expected {len(option_names)} as there are names"
+        )
+    return column_names(option_names)
 
 
 def _whole(options: Options, name: str) -> int:

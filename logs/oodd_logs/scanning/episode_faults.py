@@ -59,12 +59,12 @@ def clean(episodes: Sequence[Episode]) -> tuple[list[CleanedEpisode], Floats]:
     The second value is the usual deviation of each sensor, (D,).
     """
     # Medians, so that no broken number spoils them.
-    offset, spread = _usual([one.observations for one in episodes])
-    _, commanded = _usual([one.actions for one in episodes])
+    offset, spread = _usual([episode.observations for episode in episodes])
+    _, commanded = _usual([episode.actions for episode in episodes])
     cleaned = []
-    for one in episodes:
-        rows = one.observations - offset
-        held = _held(rows, spread), _held(one.actions, commanded)
+    for episode in episodes:
+        rows = episode.observations - offset
+        held = _held(rows, spread), _held(episode.actions, commanded)
         cleaned.append(CleanedEpisode(Trajectory(*held), rows))
     return cleaned, spread
 
@@ -104,35 +104,37 @@ def stream_faults(
     fdr: float,
 ) -> list[tuple[EpisodeFault, ...]]:
     """Return the faults of each episode, by limits from the others."""
-    each = [StreamLimits.fit([one.trajectory]) for one in cleaned]
-    columns = {f.name: np.stack([getattr(one, f.name) for one in each]) for f in fields(each[0])}
+    each = [StreamLimits.fit([episode.trajectory]) for episode in cleaned]
+    columns = {
+        f.name: np.stack([getattr(limits, f.name) for limits in each]) for f in fields(each[0])
+    }
     breaks = breaks_of(episodes)
     faults = []
-    for i, (one, rows) in enumerate(zip(episodes, cleaned, strict=True)):
-        others = {name: np.delete(column, i, axis=0) for name, column in columns.items()}
+    for i, (episode, rows) in enumerate(zip(episodes, cleaned, strict=True)):
+        other_limits = {name: np.delete(column, i, axis=0) for name, column in columns.items()}
         p = fdr / len(episodes) / len(names)
-        limits = _common(others, spread, p)
-        seen = _in_rows(rows.observations, one.actions, Stream(limits), names)
+        limits = _common(other_limits, spread, p)
+        seen = _in_rows(rows.observations, episode.actions, Stream(limits), names)
         usual = _most(np.delete(breaks, i)[:, None], p)[0]
-        faults.append((*seen, *gaps(one.time, float(breaks[i]), usual)))
+        faults.append((*seen, *gaps(episode.time, float(breaks[i]), usual)))
     return faults
 
 
-def _common(others: Mapping[str, Floats], spread: Floats, p: float) -> StreamLimits:
+def _common(other_limits: Mapping[str, Floats], spread: Floats, p: float) -> StreamLimits:
     """Return limits of the stream from those of single other episodes."""
     # The range ends as far beyond that of all others as it is wide: what moves from day to day is
     # for the p-value to judge.
-    low, high = others["low"].min(axis=0), others["high"].max(axis=0)
+    low, high = other_limits["low"].min(axis=0), other_limits["high"].max(axis=0)
     with np.errstate(invalid="ignore"):
         width = np.where(np.isfinite(low) & np.isfinite(high), high - low, np.inf)
     return StreamLimits(
-        np.median(others["mean"], axis=0),
+        np.median(other_limits["mean"], axis=0),
         np.where(np.isfinite(spread), spread, 1.0),
         low - width,
         high + width,
-        np.maximum(_most(others["still"], p), _RUN),
-        np.maximum(_most(others["repeated"][:, None], p)[0], _RUN),
-        np.median(others["rest"], axis=0),
+        np.maximum(_most(other_limits["still"], p), _RUN),
+        np.maximum(_most(other_limits["repeated"][:, None], p)[0], _RUN),
+        np.median(other_limits["rest"], axis=0),
     )
 
 
@@ -165,16 +167,16 @@ def breaks_of(episodes: Sequence[Episode]) -> Floats:
     """
     longest = np.ones(len(episodes))
     before: tuple[str, float] | None = None  # source, and its last time
-    for i, one in enumerate(episodes):
-        if one.time is None or len(one.time) < SHORTEST:
+    for i, episode in enumerate(episodes):
+        if episode.time is None or len(episode.time) < SHORTEST:
             continue
-        steps = np.diff(one.time)
+        steps = np.diff(episode.time)
         usual, pause = float(np.nanmedian(steps)), 0.0
-        if before is not None and before[0] == one.source:
-            pause = float(one.time[0]) - before[1]
+        if before is not None and before[0] == episode.source:
+            pause = float(episode.time[0]) - before[1]
         if usual > 0:
             longest[i] = max(float(np.nanmax(steps)), pause) / usual
-        before = one.source, float(one.time[-1])
+        before = episode.source, float(episode.time[-1])
     return longest
 
 

@@ -178,7 +178,7 @@ class Scan:
     @property
     def odd(self) -> list[ScannedEpisode]:
         """The odd episodes, in recorded order."""
-        return [one for one in self.episodes if one.odd]
+        return [scanned for scanned in self.episodes if scanned.odd]
 
     def as_json(self) -> dict[str, Any]:
         """Return the scan as values for JSON, which docs/how-to/scan.md describes.
@@ -194,8 +194,8 @@ class Scan:
             "fdr": self.fdr,
             "sensors": list(self.sensors),
             "notes": list(self.notes),
-            "odd": [one.episode.name for one in self.odd],
-            "episodes": [one.as_json() for one in self.episodes],
+            "odd": [scanned.episode.name for scanned in self.odd],
+            "episodes": [scanned.as_json() for scanned in self.episodes],
         }
 
 
@@ -272,14 +272,14 @@ def scan_episodes(
     """
     if not 0 < fdr < 1:
         raise UsageError(f"fdr={fdr!r}, expected a share between 0 and 1")
-    recorded = [_as_episode(one, i) for i, one in enumerate(episodes)]
-    widths = sorted({one.observations.shape[1] for one in recorded})
+    recorded = [_as_episode(episode, i) for i, episode in enumerate(episodes)]
+    widths = sorted({episode.observations.shape[1] for episode in recorded})
     if len(widths) != 1:
         raise UsageError(f"episodes have {widths} sensors, expected the same number in all")
     names = sensor_names(sensors, widths[0])
     recorded, notes = _cut(recorded, window)
     shortest = baseline + SHORTEST
-    usable = [one for one in recorded if len(one.observations) >= shortest]
+    usable = [episode for episode in recorded if len(episode.observations) >= shortest]
     if len(usable) < len(recorded):
         count = len(recorded) - len(usable)
         notes.append(f"Left out: {counted(count, 'episode(s)')} of fewer than {shortest} rows.")
@@ -299,33 +299,33 @@ def scan_episodes(
     defaults = _QUICK if detector == SCANNER else {}
     fit = _Fit(detector, seed, horizon, {**defaults, **(parameters or {})}, baseline)
     handle = fit.handle()
-    trajectories = [one.trajectory for one in cleaned]
+    trajectories = [episode.trajectory for episode in cleaned]
     folds = [range(k, len(usable), FITS) for k in range(min(FITS, len(usable)))]
-    others = [[x for i, x in enumerate(trajectories) if i not in fold] for fold in folds]
+    training = [[x for i, x in enumerate(trajectories) if i not in fold] for fold in folds]
     left_out = [[trajectories[i] for i in fold] for fold in folds]
     if jobs == 1:
-        answers = [*map(fit.judge, others, left_out)]
+        answers = [*map(fit.judge, training, left_out)]
     else:
         with ProcessPoolExecutor(min(jobs, len(folds)), get_context("spawn")) as pool:
-            answers = [*pool.map(fit.judge, others, left_out)]
+            answers = [*pool.map(fit.judge, training, left_out)]
     numbers = itertools.chain(*folds)
     outcomes = dict(zip(numbers, itertools.chain(*answers), strict=True))
     scores = [outcomes[i][0] for i in range(len(usable))]
     judged = []
-    for i, one in enumerate(usable):
+    for i, episode in enumerate(usable):
         statistic = _statistic(handle.alarm, scores, _peers(usable, i), i)
         answer = scores[i], statistic, outcomes[i][1], faults[i]
-        judged.append(_Judged(one, *answer, trajectories[i], baseline))
+        judged.append(_Judged(episode, *answer, trajectories[i], baseline))
     how = "each episode is judged by a fit that has not seen it."
     notes.insert(0, f"{counted(len(usable), 'episode(s)')}, {counted(len(folds), 'fit(s)')}: {how}")
     name = handle.state["name"] or type(handle.detector).__name__
     return _verdict(judged, names, _Terms(f"{name}, fitted on the other episodes", fdr, notes))
 
 
-def _as_episode(one: Episode | ArrayLike, number: int) -> Episode:
-    if isinstance(one, Episode):
-        return one
-    rows = np.asarray(one, dtype=np.float64)
+def _as_episode(episode: Episode | ArrayLike, number: int) -> Episode:
+    if isinstance(episode, Episode):
+        return episode
+    rows = np.asarray(episode, dtype=np.float64)
     if rows.ndim != 2 or 0 in rows.shape:
         raise UsageError(f"episode {number} has shape {rows.shape}, expected (rows, sensors)")
     name = f"episode {number}"
@@ -343,22 +343,22 @@ def _cut(episodes: list[Episode], window: int | None) -> tuple[list[Episode], li
     if window < SHORTEST:
         raise UsageError(f"window={window}, expected at least {SHORTEST} rows")
     return [
-        _rows(one, start, start + window)
-        for one in episodes
-        for start in range(0, len(one.observations), window)
+        _rows(episode, start, start + window)
+        for episode in episodes
+        for start in range(0, len(episode.observations), window)
     ], notes
 
 
-def _rows(one: Episode, start: int, stop: int) -> Episode:
-    inside = [(max(a, start) - start, min(b, stop) - start) for a, b in one.intervals if a >= 0]
+def _rows(episode: Episode, start: int, stop: int) -> Episode:
+    inside = [(max(a, start) - start, min(b, stop) - start) for a, b in episode.intervals if a >= 0]
     return replace(
-        one,
-        name=f"{one.name}[{start}:{start + len(one.observations[start:stop])}]",
-        observations=one.observations[start:stop],
-        actions=one.actions[start : stop - 1],
+        episode,
+        name=f"{episode.name}[{start}:{start + len(episode.observations[start:stop])}]",
+        observations=episode.observations[start:stop],
+        actions=episode.actions[start : stop - 1],
         rewards=None,
         intervals=tuple((a, b) for a, b in inside if a < b),
-        time=None if one.time is None else one.time[start:stop],
+        time=None if episode.time is None else episode.time[start:stop],
     )
 
 
@@ -370,33 +370,37 @@ def _scan_with(
     if unknown:
         raise UnknownNameError("sensor of the logs", unknown[0], names)
     order = [names.index(name) for name in watchdog.sensors]
-    episodes = [replace(one, observations=one.observations[:, order]) for one in episodes]
+    episodes = [
+        replace(episode, observations=episode.observations[:, order]) for episode in episodes
+    ]
     breaks = breaks_of(episodes)
     judged = [
-        _watched(watchdog.copy(), one, float(longest), rows.trajectory)
-        for one, longest, rows in zip(episodes, breaks, clean(episodes)[0], strict=True)
+        _watched(watchdog.copy(), episode, float(longest), rows.trajectory)
+        for episode, longest, rows in zip(episodes, breaks, clean(episodes)[0], strict=True)
     ]
     notes.insert(
         0, f"{counted(len(episodes), 'episode(s)')}, judged by a watchdog: {watchdog.promise}."
     )
     terms = _Terms("a watchdog", fdr, notes, watchdog.rule.threshold)
-    if (known := watchdog.calibration) is not None:
-        enough = (len(known.largest) + 1) * fdr >= len(episodes)
-        reference = np.array(known.largest)
-        terms = replace(terms, reference=reference, exact=enough and not known.rolling)
+    if (calibration := watchdog.calibration) is not None:
+        enough = (len(calibration.largest) + 1) * fdr >= len(episodes)
+        reference = np.array(calibration.largest)
+        terms = replace(terms, reference=reference, exact=enough and not calibration.rolling)
     return _verdict(judged, watchdog.sensors, terms)
 
 
-def _watched(watchdog: Watchdog, one: Episode, longest: float, trajectory: Trajectory) -> "_Judged":
-    rows, sensors = one.observations.shape
+def _watched(
+    watchdog: Watchdog, episode: Episode, longest: float, trajectory: Trajectory
+) -> "_Judged":
+    rows, sensors = episode.observations.shape
     scores, statistic = np.full((2, rows), np.nan)
     shares, onsets = np.full((rows, sensors), np.nan), np.full(rows, -1)
     faults: dict[tuple[str, str], int] = {}
-    actions = [None, *one.actions] if one.actions.shape[1] else [None] * rows
+    actions = [None, *episode.actions] if episode.actions.shape[1] else [None] * rows
     times = [None] * rows
-    if one.time is not None and watchdog.settings.rate is not None:
-        times = one.time.tolist()
-    for t, (row, action) in enumerate(zip(one.observations, actions, strict=True)):
+    if episode.time is not None and watchdog.settings.rate is not None:
+        times = episode.time.tolist()
+    for t, (row, action) in enumerate(zip(episode.observations, actions, strict=True)):
         reading = watchdog.update(row, action, times[t])
         scores[t], statistic[t] = reading.score, reading.statistic
         if reading.onset is not None:
@@ -404,8 +408,8 @@ def _watched(watchdog: Watchdog, one: Episode, longest: float, trajectory: Traje
             shares[t] = [reading.sensors.get(name, 0.0) for name in watchdog.sensors]
         for key in reading.faults.items():
             faults.setdefault(key, t)
-    seen = *(EpisodeFault(*key, t) for key, t in faults.items()), *gaps(one.time, longest)
-    return _Judged(one, scores, statistic, Explanation(shares, onsets), seen, trajectory)
+    seen = *(EpisodeFault(*key, t) for key, t in faults.items()), *gaps(episode.time, longest)
+    return _Judged(episode, scores, statistic, Explanation(shares, onsets), seen, trajectory)
 
 
 @dataclass(frozen=True, slots=True)
@@ -424,14 +428,16 @@ class _Fit:
             self.detector, None, self.seed, self.horizon, self.parameters, self.baseline
         )
 
-    def judge(self, others: Sequence[Trajectory], episodes: Sequence[Trajectory]) -> list[Outcome]:
-        """Fit on some episodes and judge others."""
+    def judge(
+        self, training: Sequence[Trajectory], episodes: Sequence[Trajectory]
+    ) -> list[Outcome]:
+        """Fit on training episodes and judge others."""
         handle = self.handle()
         detector = handle.detector
-        base = Baseline.fit(others, self.baseline) if self.baseline else None
+        base = Baseline.fit(training, self.baseline) if self.baseline else None
         hidden = 0 if handle.adapts else self.baseline
         try:
-            detector.fit([handle.visible(x, base) for x in others])
+            detector.fit([handle.visible(x, base) for x in training])
             outcomes: list[Outcome] = []
             for x in episodes:
                 scores, explanation = handle.scores(x, base), None
@@ -447,8 +453,8 @@ class _Fit:
             raise
         except Exception as error:
             name = type(detector).__name__
-            what = f"detector {name} raised {type(error).__name__}: {error}"
-            raise ContractError(f"{what} (fitted on {len(others)} episodes)") from error
+            failure = f"detector {name} raised {type(error).__name__}: {error}"
+            raise ContractError(f"{failure} (fitted on {len(training)} episodes)") from error
         return outcomes
 
 
@@ -499,21 +505,23 @@ class _Terms:
 
 def _verdict(judged: Sequence[_Judged], names: Sequence[str], terms: _Terms) -> Scan:
     """Compare the episodes' largest statistics, and look for rows and sensors."""
-    episodes = [one.episode for one in judged]
-    largest = np.array([np.nanmax(one.statistic, initial=-math.inf) for one in judged])
+    episodes = [judgement.episode for judgement in judged]
+    largest = np.array([np.nanmax(judgement.statistic, initial=-math.inf) for judgement in judged])
     references = [
         largest[_peers(episodes, i)] if terms.reference is None else terms.reference
         for i in range(len(episodes))
     ]
-    tails = [Tail.fit(others) for others in references]
-    ranks = np.array([rank_p(x, others) for x, others in zip(largest, references, strict=True)])
+    tails = [Tail.fit(reference) for reference in references]
+    ranks = np.array(
+        [rank_p(x, reference) for x, reference in zip(largest, references, strict=True)]
+    )
     p = ranks.copy()
     for i, tail in enumerate(tails):
         if tail is not None and largest[i] > tail.start and not terms.exact:
             p[i] = tail.p(largest[i])
     fewest = min(map(len, references)) + 1
-    notes, known = [*terms.notes], fewest >= LEAST
-    if not known:
+    notes, has_p_values = [*terms.notes], fewest >= LEAST
+    if not has_p_values:
         p[:] = math.nan
         deciding = "faults of the stream decide"
         if terms.limit > 0:
@@ -528,44 +536,44 @@ def _verdict(judged: Sequence[_Judged], names: Sequence[str], terms: _Terms) -> 
             f"The {fewest - 1} calibration episodes are enough for p-values by rank, which keep "
             "the false discovery rate whatever the distribution."
         )
-    q = q_values(p) if known else p
-    critical = critical_p(p, terms.fdr) if known else math.nan
-    sums = np.stack([one.sums for one in judged])
+    q = q_values(p) if has_p_values else p
+    critical = critical_p(p, terms.fdr) if has_p_values else math.nan
+    sums = np.stack([judgement.sums for judgement in judged])
     scanned = []
-    for i, one in enumerate(judged):
+    for i, judgement in enumerate(judged):
         tail, threshold = tails[i], terms.limit
-        if known:
+        if has_p_values:
             threshold = math.nan if tail is None else tail.threshold(critical)
             if terms.exact:
                 threshold = rank_threshold(critical, references[i])
-        rejected = bool(q[i] <= terms.fdr if known else largest[i] > terms.limit)
+        rejected = bool(q[i] <= terms.fdr if has_p_values else largest[i] > terms.limit)
         # Rounding of the threshold may leave nothing but the largest statistic.
-        above = runs_of(rejected & (one.statistic >= np.fmin(threshold, largest[i])))
+        above = runs_of(rejected & (judgement.statistic >= np.fmin(threshold, largest[i])))
         row = since = None
         shares: dict[str, float] = {}
         if rejected:
             row = above[0][0]
-            others = np.delete(sums, i, axis=0).sum(axis=0)
+            other_sums = np.delete(sums, i, axis=0).sum(axis=0)
             usual = -math.inf if tail is None else tail.start
-            since, values = _blame(one, usual, above[0], others)
+            since, values = _blame(judgement, usual, above[0], other_sums)
             order = np.argsort(-values, kind="stable").tolist()
             shares = {names[d]: float(values[d]) for d in order}
         scanned.append(
             ScannedEpisode(
-                one.episode,
-                one.scores,
-                one.statistic,
+                judgement.episode,
+                judgement.scores,
+                judgement.statistic,
                 float(largest[i]),
                 float(ranks[i]),
                 float(p[i]),
                 float(q[i]),
                 threshold,
-                rejected or bool(one.faults),
+                rejected or bool(judgement.faults),
                 row,
                 since,
                 tuple(above),
                 shares,
-                one.faults,
+                judgement.faults,
             )
         )
     return Scan(scanned, names, terms.judge, terms.fdr, notes)
@@ -573,9 +581,9 @@ def _verdict(judged: Sequence[_Judged], names: Sequence[str], terms: _Terms) -> 
 
 def _peers(episodes: Sequence[Episode], i: int) -> list[int]:
     """Return what an episode is compared with: others of its task where these suffice, else all."""
-    others = [j for j in range(len(episodes)) if j != i]
-    same = [j for j in others if episodes[j].task == episodes[i].task]
-    return same if len(same) + 1 >= LEAST else others
+    candidates = [j for j in range(len(episodes)) if j != i]
+    same = [j for j in candidates if episodes[j].task == episodes[i].task]
+    return same if len(same) + 1 >= LEAST else candidates
 
 
 def _statistic(kind: AlarmKind, scores: Sequence[Floats], peers: Sequence[int], i: int) -> Floats:
@@ -584,14 +592,14 @@ def _statistic(kind: AlarmKind, scores: Sequence[Floats], peers: Sequence[int], 
     # no odd episode among them spoils.
     standardization = None
     if kind == "cusum":
-        known = (Standardization.fit([scores[j]]) for j in peers)
-        mean, std = np.nanmedian([[one.mean, one.std] for one in known], axis=0)
+        standardizations = (Standardization.fit([scores[j]]) for j in peers)
+        mean, std = np.nanmedian([[s.mean, s.std] for s in standardizations], axis=0)
         standardization = Standardization(float(mean), float(std))
     return GuaranteedAlarm(standardization, math.inf).statistic(scores[i])
 
 
 def _blame(
-    judged: _Judged, usual: float, interval: tuple[int, int], others: Floats
+    judged: _Judged, usual: float, interval: tuple[int, int], other_sums: Floats
 ) -> tuple[int, Floats]:
     """Return the row with which an excursion began, and the share of each sensor in it, (D,)."""
     # It is above the threshold in the interval; before it the statistic was above what is usual.
@@ -600,7 +608,7 @@ def _blame(
         return int(judged.explanation.onsets[row]), judged.explanation.shares[row]
     quiet = np.flatnonzero(judged.statistic[:row] <= usual)
     since = int(quiet[-1]) + 1 if len(quiet) else 0
-    n, total, squares = others[:, :, None]
+    n, total, squares = other_sums[:, :, None]
     # A single episode has no others.
     mean = total / np.maximum(n, 1.0)
     std = np.sqrt(np.maximum(squares / np.maximum(n, 1.0) - mean**2, 0.0))

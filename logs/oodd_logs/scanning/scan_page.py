@@ -80,7 +80,7 @@ def page(scan: Scan, title: str = "Scan") -> str:
     str
         A whole document.
     """
-    heading, odd = html.escape(title), [i for i, one in enumerate(scan.episodes) if one.odd]
+    heading, odd = html.escape(title), [i for i, scanned in enumerate(scan.episodes) if scanned.odd]
     head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width">'
     text = [
         f'<!doctype html><html lang="en"><head>{head}<title>{heading}</title>',
@@ -90,13 +90,13 @@ def page(scan: Scan, title: str = "Scan") -> str:
         *([f'<p class="dim">{_LEGEND}</p>'] if odd else []),
     ]
     for i in odd[:PICTURES]:
-        one = scan.episodes[i]
-        about = html.escape(describe(one))
-        if one.label:
-            about += f' <span class="dim">The logs say: {html.escape(one.label)}.</span>'
+        scanned = scan.episodes[i]
+        about = html.escape(describe(scanned))
+        if scanned.label:
+            about += f' <span class="dim">The logs say: {html.escape(scanned.label)}.</span>'
         text.append(
-            f'<h2 id="episode-{i}">{html.escape(one.episode.name)}</h2><p>{about}</p>'
-            f'<div class="wide">{picture(one, scan.sensors)}</div>'
+            f'<h2 id="episode-{i}">{html.escape(scanned.episode.name)}</h2><p>{about}</p>'
+            f'<div class="wide">{picture(scanned, scan.sensors)}</div>'
         )
     if len(odd) > PICTURES:
         text.append(f"<p>And {len(odd) - PICTURES} more odd episodes without a picture.</p>")
@@ -107,20 +107,20 @@ def page(scan: Scan, title: str = "Scan") -> str:
 def _table(episodes: Sequence[ScannedEpisode]) -> str:
     names = titles(episodes)
     lines = ["".join(f"<th{' class=number' * (name in NUMBERS)}>{name}</th>" for name in names)]
-    for i, one in enumerate(episodes):
-        name, *others = map(html.escape, cells(one))
-        line = f'<td><a href="#episode-{i}">{name}</a></td>' if one.odd else f"<td>{name}</td>"
-        for title, text in zip(names[1:], others, strict=False):
+    for i, scanned in enumerate(episodes):
+        name, *texts = map(html.escape, cells(scanned))
+        line = f'<td><a href="#episode-{i}">{name}</a></td>' if scanned.odd else f"<td>{name}</td>"
+        for title, text in zip(names[1:], texts, strict=False):
             line += f"<td class={'number' if title in NUMBERS else 'words'}>{text}</td>"
         lines.append(line)
-    odd = [False, *(one.odd for one in episodes)]
+    odd = [False, *(scanned.odd for scanned in episodes)]
     rows = [f"<tr{' class=odd' * o}>{line}</tr>" for o, line in zip(odd, lines, strict=True)]
     return f'<div class="wide"><table>{chr(10).join(rows)}</table></div>'
 
 
 def titles(episodes: Sequence[ScannedEpisode]) -> tuple[str, ...]:
     """Return the titles of `cells`; the last one, of labels, where any episode has one."""
-    return TITLES if any(one.label for one in episodes) else TITLES[:-1]
+    return TITLES if any(scanned.label for scanned in episodes) else TITLES[:-1]
 
 
 def cells(one: ScannedEpisode, *, brief: bool = False) -> list[str]:
@@ -200,7 +200,7 @@ def _panel(
     top: int,
     height: int,
     rows: range,
-    one: ScannedEpisode,
+    scanned: ScannedEpisode,
     limit: float = math.nan,
     *,
     logarithmic: bool = False,
@@ -225,14 +225,14 @@ def _panel(
 
     parts = [
         _tag("rect", class_="shade", x=x(a), y=top, width=max(1.0, x(b - 1) - x(a)), height=height)
-        for start, stop in one.intervals
+        for start, stop in scanned.intervals
         if (a := max(start, begin)) < (b := min(stop, end))
     ]
     parts.append(_tag("rect", class_="frame", x=_LEFT, y=top, width=width, height=height))
     if is_limited:
         parts.append(_tag("line", class_="limit", x1=_LEFT, x2=right, y1=y(limit), y2=y(limit)))
-    if one.first is not None and one.first in rows:
-        at = x(one.first)
+    if scanned.first is not None and scanned.first in rows:
+        at = x(scanned.first)
         parts.append(_tag("line", class_="first", y1=top, y2=bottom, x1=at, x2=at))
     for run in runs_of(np.isfinite(visible)):
         points = " ".join(f"{x(begin + r):.1f},{y(v):.1f}" for r, v in _thinned(visible, *run))
@@ -241,7 +241,7 @@ def _panel(
         parts.append(text(_LEFT - 6, line, figure(10**value if logarithmic else value)))
     parts.append(_tag("text", html.escape(name), class_="name", x=_LEFT, y=top - 5))
     if is_limited:
-        parts.append(text(right, top - 5, f"dashed: threshold {figure(one.threshold)}"))
+        parts.append(text(right, top - 5, f"dashed: threshold {figure(scanned.threshold)}"))
     parts.append(text(float(_LEFT), bottom + 13, f"row {begin}", "start"))
     parts.append(text(float(right), bottom + 13, f"row {end - 1}"))
     return "".join(parts)

@@ -50,23 +50,23 @@ def write_rerun(scan: Scan, path: Path) -> None:
     with replacing(path) as temporary:
         recording = rr.RecordingStream("oodd-eval scan")
         recording.save(temporary)
-        for name, one in _named(scan):
+        for name, scanned in _named(scan):
 
             def send(entity: tuple[str, ...], rows: Any, columns: Any) -> None:
                 timelines = [rr.TimeColumn("row", sequence=rows)]
-                if (time := one.episode.time) is not None:  # noqa: B023  called in this turn
+                if (time := scanned.episode.time) is not None:  # noqa: B023  called in this turn
                     timelines.append(rr.TimeColumn("time", duration=time[rows]))
                 path = rr.new_entity_path([name, *entity])  # noqa: B023
                 recording.send_columns(path, timelines, columns)
 
-            usable = np.arange(len(one.scores))
-            if one.episode.time is not None:
-                usable = usable[np.isfinite(one.episode.time)]
-            for entity, values in _series(one, scan).items():
+            usable = np.arange(len(scanned.scores))
+            if scanned.episode.time is not None:
+                usable = usable[np.isfinite(scanned.episode.time)]
+            for entity, values in _series(scanned, scan).items():
                 rows = usable[np.isfinite(values[usable])]
                 send(entity, rows, rr.Scalars.columns(scalars=values[rows]))
-            if (first := one.first) is not None and first in usable:
-                text = [", ".join(one.suspects)]
+            if (first := scanned.first) is not None and first in usable:
+                text = [", ".join(scanned.suspects)]
                 send(("suspects",), np.array([first]), rr.TextLog.columns(text=text))
         recording.flush()
         recording.disconnect()
@@ -102,13 +102,13 @@ def write_mcap(scan: Scan, path: Path) -> None:
         for kind, properties in (("sensors", readings), ("oodd", _VERDICT)):
             schema = json.dumps({"type": "object", "properties": properties}).encode()
             schemas[kind] = writer.register_schema(f"oodd.{kind}", "jsonschema", schema)
-        for name, one in _named(scan):
+        for name, scanned in _named(scan):
             channels = {
                 kind: writer.register_channel(f"/{name}/{kind}", "json", schema)
                 for kind, schema in schemas.items()
             }
-            for t, alarm in enumerate(one.alarms.tolist()):
-                time, message = one.episode.time, _message(one, scan, t, alarm=alarm)
+            for t, alarm in enumerate(scanned.alarms.tolist()):
+                time, message = scanned.episode.time, _message(scanned, scan, t, alarm=alarm)
                 seconds = float(t if time is None else time[t])
                 stamp = max(0, as_nanoseconds(seconds)) if math.isfinite(seconds) else 0
                 for kind, channel in channels.items():
@@ -120,32 +120,32 @@ def write_mcap(scan: Scan, path: Path) -> None:
 
 def _named(scan: Scan) -> list[tuple[str, ScannedEpisode]]:
     """Return the episodes by name, with their number where a name occurs twice."""
-    names = [one.episode.name for one in scan.episodes]
+    names = [scanned.episode.name for scanned in scan.episodes]
     return [
-        (name if names.count(name) == 1 else f"{name} ({i})", one)
-        for i, (name, one) in enumerate(zip(names, scan.episodes, strict=True))
+        (name if names.count(name) == 1 else f"{name} ({i})", scanned)
+        for i, (name, scanned) in enumerate(zip(names, scan.episodes, strict=True))
     ]
 
 
-def _series(one: ScannedEpisode, scan: Scan) -> dict[tuple[str, ...], Any]:
-    columns = one.episode.observations.T
+def _series(scanned: ScannedEpisode, scan: Scan) -> dict[tuple[str, ...], Any]:
+    columns = scanned.episode.observations.T
     readings = {("sensors", name): c for name, c in zip(scan.sensors, columns, strict=True)}
     return readings | {
-        ("score",): one.scores,
-        ("statistic",): one.statistic,
-        ("threshold",): np.full(len(one.scores), one.threshold),
-        ("alarm",): one.alarms.astype(np.float64),
+        ("score",): scanned.scores,
+        ("statistic",): scanned.statistic,
+        ("threshold",): np.full(len(scanned.scores), scanned.threshold),
+        ("alarm",): scanned.alarms.astype(np.float64),
     }
 
 
-def _message(one: ScannedEpisode, scan: Scan, t: int, *, alarm: bool) -> dict[str, Any]:
+def _message(scanned: ScannedEpisode, scan: Scan, t: int, *, alarm: bool) -> dict[str, Any]:
     """Return the content of both topics at a row."""
     verdict = {
-        "score": float(one.scores[t]),
-        "statistic": float(one.statistic[t]),
-        "threshold": one.threshold,
+        "score": float(scanned.scores[t]),
+        "statistic": float(scanned.statistic[t]),
+        "threshold": scanned.threshold,
         "alarm": alarm,
-        "suspects": one.suspects if alarm else [],
+        "suspects": scanned.suspects if alarm else [],
     }
-    readings = one.episode.observations[t].tolist()
+    readings = scanned.episode.observations[t].tolist()
     return {"sensors": dict(zip(scan.sensors, readings, strict=True)), "oodd": verdict}
