@@ -1,4 +1,4 @@
-"""What promises of false alarms on a split rest on, before any detector is fitted."""
+"""Findings on which promises of false alarms on a split rest, before any detector is fitted."""
 
 from collections.abc import Sequence
 from itertools import islice
