@@ -21,8 +21,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from oodd_leaderboard.entry import ENTRY, read_entries, suite_sections
 from oodd_leaderboard.pages import build
+from oodd_leaderboard.reported import ENTRY, read_entries, suite_sections
 
 from oodd_eval.results.directory import RECORDS
 from oodd_eval.results.standings import SEEDS

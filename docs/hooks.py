@@ -16,8 +16,8 @@ import click
 from figures import environments
 from latex2mathml.converter import convert
 from oodd_leaderboard import site
-from oodd_leaderboard.entry import read_entries, sections, suite_sections
 from oodd_leaderboard.pages import CELLS, cells
+from oodd_leaderboard.reported import read_entries, sections, suite_sections
 from properdocs.config.defaults import ProperDocsConfig
 from properdocs.structure import StructureItem
 from properdocs.structure.files import File, Files

@@ -10,7 +10,13 @@ from helpers_records import PAIRED, make_record
 from oodd_leaderboard import site
 from oodd_leaderboard.curve_file import write_curves
 from oodd_leaderboard.curves import Sweep, cell_curves, thresholds
-from oodd_leaderboard.entry import EntryInfo, SubmittedEntry, read_entries, sections, suite_sections
+from oodd_leaderboard.reported import (
+    EntryInfo,
+    SubmittedEntry,
+    read_entries,
+    sections,
+    suite_sections,
+)
 from oodd_leaderboard.site.content import site_data
 
 from oodd_eval.data.condition import rungs_of

@@ -5,7 +5,7 @@ import functools
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from oodd_leaderboard.entry import SubmittedEntry, read_entries
+from oodd_leaderboard.reported import SubmittedEntry, read_entries
 
 from oodd_eval.results.board import Board, boards
 from oodd_eval.results.directory import ResultsDirectory

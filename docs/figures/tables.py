@@ -35,8 +35,8 @@ from committed import (
     overview,
     ranking,
 )
-from oodd_leaderboard.entry import sections, suite_sections
 from oodd_leaderboard.pages import documents
+from oodd_leaderboard.reported import sections, suite_sections
 
 from oodd_eval.cli.main import main as oodd_eval
 from oodd_eval.data.files import read_text

@@ -17,7 +17,7 @@ from oodd_eval.metrics.catalogue import metric_info
 from oodd_eval.results.board import Board, boards
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.standings import primary_settings
-from oodd_leaderboard.entry import SubmittedEntry
+from oodd_leaderboard.reported import SubmittedEntry
 
 _TASK: Final = {"type": "anomaly-detection", "name": "Detection of out-of-distribution dynamics"}
 

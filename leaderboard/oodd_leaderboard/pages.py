@@ -25,7 +25,8 @@ from oodd_eval.results.report import findings_of
 from oodd_eval.results.standings import RankedBoard, primary_settings, verdict_of
 from oodd_eval.results.tables import Tables
 from oodd_leaderboard import site
-from oodd_leaderboard.entry import (
+from oodd_leaderboard.published import PUBLISHED, published_bytes
+from oodd_leaderboard.reported import (
     REPORTED,
     SUITES,
     TABLES,
@@ -34,7 +35,6 @@ from oodd_leaderboard.entry import (
     SuiteSection,
     sections,
 )
-from oodd_leaderboard.published import PUBLISHED, published_bytes
 
 PAGE: Final = "README.md"
 SITE: Final = "site"

@@ -39,7 +39,7 @@ from oodd_eval.results.standings import (
     ranked,
 )
 from oodd_eval.results.tables import printed_rank, texts
-from oodd_leaderboard.entry import LeaderboardSection, SuiteSection
+from oodd_leaderboard.reported import LeaderboardSection, SuiteSection
 
 PUBLISHED: Final = "published.jsonl.xz"
 

@@ -7,7 +7,7 @@ import pytest
 from helpers_split import make_split
 from helpers_submission import Draft
 from oodd_leaderboard import verify as verification
-from oodd_leaderboard.entry import read_entries, sections
+from oodd_leaderboard.reported import read_entries, sections
 from oodd_leaderboard.submit import Statement, submit
 from oodd_leaderboard.verify import verify
 

@@ -6,8 +6,8 @@ Its numbers are among those that ``docs/figures/tables.py --check`` compares.
 from pathlib import Path
 
 import pytest
-from oodd_leaderboard.entry import read_entries, sections
 from oodd_leaderboard.published import PUBLISHED, board_of, placement, read_published
+from oodd_leaderboard.reported import read_entries, sections
 from oodd_leaderboard.verify import verify
 
 BOARD = Path(__file__).parents[2] / "leaderboard"

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import yaml
 from oodd_leaderboard import hub
-from oodd_leaderboard.entry import read_entry
+from oodd_leaderboard.reported import read_entry
 
 from oodd_eval.cli import main as cli
 from oodd_eval.errors import UsageError

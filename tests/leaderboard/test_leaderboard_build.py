@@ -12,9 +12,9 @@ import pytest
 from helpers_records import PAIRED, example, make_record
 from helpers_site import submitted as entry
 from oodd_leaderboard import pages as leaderboard_build
-from oodd_leaderboard.entry import REPORTED, read_entries, sections
 from oodd_leaderboard.pages import cells, page
 from oodd_leaderboard.published import PUBLISHED
+from oodd_leaderboard.reported import REPORTED, read_entries, sections
 
 from oodd_eval.cli.main import main
 from oodd_eval.data.facts import ENVIRONMENTS, SPLITS, TABLE1

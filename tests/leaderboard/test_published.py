@@ -11,7 +11,6 @@ from helpers_records import make_record
 from helpers_site import submitted
 from oodd_leaderboard import published
 from oodd_leaderboard.commands import published_board as board_command
-from oodd_leaderboard.entry import REPORTED, SuiteSection, sections
 from oodd_leaderboard.published import (
     board_of,
     neighbours,
@@ -21,6 +20,7 @@ from oodd_leaderboard.published import (
     rankings,
     read_published,
 )
+from oodd_leaderboard.reported import REPORTED, SuiteSection, sections
 
 from oodd_eval.cli.main import main
 from oodd_eval.data.files import decompress

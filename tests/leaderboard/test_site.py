@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from oodd_leaderboard import site
 from oodd_leaderboard.curve_file import read_curves
-from oodd_leaderboard.entry import REPORTED, read_entries, sections
+from oodd_leaderboard.reported import REPORTED, read_entries, sections
 from oodd_leaderboard.site.content import (
     WITH_INTERVALS,
     gridded,

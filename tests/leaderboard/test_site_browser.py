@@ -8,7 +8,7 @@ import helpers_site
 import pytest
 from oodd_leaderboard import site
 from oodd_leaderboard.curve_file import read_curves
-from oodd_leaderboard.entry import REPORTED, read_entries, sections
+from oodd_leaderboard.reported import REPORTED, read_entries, sections
 from oodd_leaderboard.site.content import site_data
 
 from oodd_eval.data.facts import ANOMALIES

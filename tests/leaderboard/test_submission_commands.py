@@ -14,7 +14,7 @@ import helpers_plugins
 import pytest
 from helpers_records import make_record
 from helpers_submission import Draft
-from oodd_leaderboard.entry import commands_of, read_entries
+from oodd_leaderboard.reported import commands_of, read_entries
 
 from oodd_eval.cli import main as cli
 from oodd_eval.data.facts import ENVIRONMENTS, TABLE1

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 from helpers_split import make_split
-from oodd_leaderboard.entry import read_entries
+from oodd_leaderboard.reported import read_entries
 from oodd_leaderboard.submit import with_curves
 
 from oodd_eval.api import evaluate

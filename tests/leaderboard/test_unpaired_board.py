@@ -12,8 +12,8 @@ from helpers_submission import Draft
 from oodd_leaderboard import published, site
 from oodd_leaderboard.curve_file import check_curves, read_curves
 from oodd_leaderboard.curves import pooled_roc
-from oodd_leaderboard.entry import read_entries, sections
 from oodd_leaderboard.pages import build, differences
+from oodd_leaderboard.reported import read_entries, sections
 from oodd_leaderboard.submit import Statement, submit
 
 from oodd_eval import evaluate

@@ -17,9 +17,9 @@ from oodd_eval.errors import UsageError
 from oodd_eval.names import counted
 from oodd_leaderboard import hub
 from oodd_leaderboard import submit as submission
-from oodd_leaderboard.entry import read_entries, read_entry, suite_sections
 from oodd_leaderboard.pages import STALE, differences, stale
 from oodd_leaderboard.pages import build as build_board
+from oodd_leaderboard.reported import read_entries, read_entry, suite_sections
 from oodd_leaderboard.verify import EntryVerdict
 from oodd_leaderboard.verify import verify as check
 from oodd_leaderboard.verify import verify_changed as check_changed

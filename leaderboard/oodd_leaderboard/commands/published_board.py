@@ -25,7 +25,6 @@ from oodd_eval.results.record import Record
 from oodd_eval.results.render.tabular import ranking_csv
 from oodd_eval.results.render.text import markdown_section
 from oodd_eval.results.standings import Standing
-from oodd_leaderboard.entry import ENTRY, REPORTED, read_entry
 from oodd_leaderboard.published import (
     MARK,
     Placement,
@@ -38,6 +37,7 @@ from oodd_leaderboard.published import (
     rankings,
     read_published,
 )
+from oodd_leaderboard.reported import ENTRY, REPORTED, read_entry
 
 NEARBY: Final = 3
 """Rows above and below those of a run that `place` prints."""

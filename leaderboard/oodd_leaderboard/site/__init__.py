@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from oodd_eval._version import __version__
-from oodd_leaderboard.entry import REPORTED, LeaderboardSection, SuiteSection
+from oodd_leaderboard.reported import REPORTED, LeaderboardSection, SuiteSection
 from oodd_leaderboard.site.content import Json, site_data
 
 PAGE: Final = "index.html"

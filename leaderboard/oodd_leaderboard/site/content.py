@@ -30,7 +30,7 @@ from oodd_eval.results.standings import Standing
 from oodd_eval.results.strengths import COSTS, DETECTION, Strengths, curve
 from oodd_eval.results.tables import PAPERS, POOLED, missing_level
 from oodd_leaderboard.curve_file import read_curves
-from oodd_leaderboard.entry import LeaderboardSection, SubmittedEntry, SuiteSection, commands_of
+from oodd_leaderboard.reported import LeaderboardSection, SubmittedEntry, SuiteSection, commands_of
 
 _COMPARED: Final = (
     *("false_episodes", "early", "delay", "delay_censored", "missed"),

@@ -20,7 +20,7 @@ from oodd_eval.metrics.ranking import Position
 from oodd_eval.results.board import defined_cells
 from oodd_eval.results.directory import RECORDS
 from oodd_leaderboard.curve_file import check_curves
-from oodd_leaderboard.entry import (
+from oodd_leaderboard.reported import (
     CURVES,
     ENTRY,
     EntryInfo,

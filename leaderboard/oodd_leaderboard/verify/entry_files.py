@@ -20,7 +20,7 @@ from oodd_eval.data.bounded import read_bytes
 from oodd_eval.data.files import MAX_BYTES, PACKED, decompress, forms
 from oodd_eval.errors import ResultsError
 from oodd_eval.results.directory import RECORDS
-from oodd_leaderboard.entry import CURVES, ENTRY
+from oodd_leaderboard.reported import CURVES, ENTRY
 
 MB: Final = 10**6
 MOST_PLAIN: Final = {RECORDS: MAX_BYTES, CURVES: 16 * MB}  # decompressed sizes

@@ -19,7 +19,7 @@ from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, NAME_PATTERN, 
 from oodd_eval.results import record as record_format
 from oodd_eval.results.directory import RECORDS
 from oodd_eval.results.record import Record
-from oodd_leaderboard.entry import ENTRY, SCHEMA, EntryInfo
+from oodd_leaderboard.reported import ENTRY, SCHEMA, EntryInfo
 from oodd_leaderboard.verify.entry_files import (
     MB,
     MOST_FILES,

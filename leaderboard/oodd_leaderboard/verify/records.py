@@ -18,7 +18,7 @@ from oodd_eval.results.board import contribution, ranked_by
 from oodd_eval.results.directory import RECORDS
 from oodd_eval.results.evaluate import early_difference
 from oodd_eval.results.record import Record
-from oodd_leaderboard.entry import EntryInfo
+from oodd_leaderboard.reported import EntryInfo
 from oodd_leaderboard.verify.entry_files import Findings, plain, short
 
 Records = Mapping[str, Record]  # records by their line: ``records.jsonl:3 (<cell>)``
