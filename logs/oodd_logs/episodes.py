@@ -339,8 +339,7 @@ def _recorded(recipe: Recipe, root: Path, notes: list[str]) -> Iterator[Recorded
         TWINS: (*recipe.nominal.test, *recipe.nominal.twins),
     }
     anomalous = {f"test/{name}": table.files for name, table in recipe.anomalous.items()}
-    globs = dict.fromkeys(itertools.chain(*tables.values(), *anomalous.values()))
-    absent = [pattern for pattern in globs if not names_matching(pattern, root)]
+    absent = [pattern for pattern in recipe.globs if not names_matching(pattern, root)]
     # Who has a part of a set lacks files of some anomalies; where all lack, that is an error.
     there = {role: patterns for role, patterns in anomalous.items() if {*patterns} - {*absent}}
     roles: dict[Path, set[str]] = {}
@@ -374,6 +373,14 @@ def names_matching(pattern: str, root: Path) -> list[str]:
     """
     # Patterns may be whole paths, which `Path.glob` refuses.
     return glob.glob(pattern, root_dir=root, recursive=True)  # noqa: PTH207
+
+
+def files_of(recipe: Recipe, root: Path) -> Iterator[Path]:
+    """Yield the files that a recipe names, with the list of its intervals."""
+    for pattern in recipe.globs:
+        yield from (root / name for name in names_matching(pattern, root))
+    if isinstance(recipe.intervals, str):
+        yield root / recipe.intervals
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -25,7 +25,7 @@ from oodd_eval.data.facts import (
     Quantity,
     in_order,
 )
-from oodd_eval.data.files import only_writer
+from oodd_eval.data.files import only_writer, refuse_inputs
 from oodd_eval.data.layout import IMPORTED, Blocks
 from oodd_eval.data.parts import CALIBRATION, TRAIN, TWINS
 from oodd_eval.data.split import Split, data_home
@@ -34,6 +34,7 @@ from oodd_eval.names import check_known
 from oodd_logs.episodes import (
     EpisodeFacts,
     EpisodeSource,
+    files_of,
     make_episodes,
     matching_files,
     read_episodes,
@@ -96,12 +97,14 @@ def import_recipe(
     Raises
     ------
     UsageError
-        When a name is taken, or files or columns are not there.
+        When a name is taken, files or columns are not there, or the split would replace a log.
     TrajectoryError
         When a recording is not as it must be; the message names file and row.
     """
     recipe.check()
     target = _Target.of(recipe, output, replace=replace)
+    for name in (layout.MANIFEST, f"{recipe.environment}.h5"):
+        refuse_inputs(target.directory / name, files_of(recipe, root), "the split's file")
     with read_episodes(recipe, root) as source:
         return target.write(source, progress, report)
 

@@ -7,6 +7,7 @@ import datetime as dt
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, get_origin, get_type_hints
 
@@ -368,6 +369,14 @@ class Recipe:
         """Columns with labels, of all anomalies."""
         further = (column for table in self.anomalous.values() for column in table.labels)
         return tuple(dict.fromkeys([*self.labels, *further]))
+
+    @property
+    def globs(self) -> tuple[str, ...]:
+        """Globs of all files that it names."""
+        nominal = self.nominal
+        parts = nominal.files, nominal.train, nominal.calibration, nominal.test, nominal.twins
+        listed = chain(*parts, *(table.files for table in self.anomalous.values()))
+        return tuple(dict.fromkeys(listed))
 
     @classmethod
     def load(cls, path: Path) -> "Recipe":

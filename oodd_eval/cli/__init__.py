@@ -3,7 +3,7 @@
 import contextlib
 import stat
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from importlib import import_module
 from inspect import getdoc
@@ -16,7 +16,7 @@ import click
 from click.core import ParameterSource
 from click.shell_completion import CompletionItem
 
-from oodd_eval.errors import MissingExtraError, UnknownNameError, UsageError
+from oodd_eval.errors import MissingExtraError, OoddError, UnknownNameError, UsageError
 from oodd_eval.metrics.catalogue import LEVELS
 from oodd_eval.names import memory_bytes, parameter, read, seconds, whole_numbers
 
@@ -82,13 +82,27 @@ class Command(click.Command):
         return super().parse_args(ctx, words)
 
     def invoke(self, ctx: click.Context) -> int:
-        """Run the command and return its exit code."""
+        """Run the command and return its exit code; an output that is an input is refused."""
+        self._check_outputs(ctx)
         passed = {
             p.name: p.opts[0]
             for p in self.params
             if p.name and ctx.get_parameter_source(p.name) is ParameterSource.COMMANDLINE
         }
         return self.handler(Options(**ctx.params, invocation=ctx.obj, passed=passed))
+
+    def _check_outputs(self, ctx: click.Context) -> None:
+        """Raise `UsageError` for an output that would overwrite an input, or another output."""
+        values = [(p, ctx.params[p.name]) for p in self.params if p.name and ctx.params[p.name]]
+        outputs = [(p.opts[0], path) for p, path in values if is_output(p)]
+        if not outputs:
+            return
+        inputs = [path for p, value in values if not is_output(p) for path in _paths(p, value)]
+        refuse_inputs = load("oodd_eval.data.files:refuse_inputs")
+        for i, (option, path) in enumerate(outputs):
+            refuse_inputs(path, inputs, option)
+            if path in (taken for _, taken in outputs[:i]):
+                raise UsageError(f"two outputs are {str(path)!r}: {option} would replace the first")
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the examples."""
@@ -227,13 +241,13 @@ class Names(click.ParamType[str]):
     name = "names"
 
     def __init__(self, *kinds: str) -> None:
-        self._kinds = kinds
+        self.kinds = kinds
 
     def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
         """Return the list with each name that begins like its last one."""
         del ctx, param
         before, comma, last = incomplete.rpartition(",")
-        names = chain.from_iterable(map(_names, self._kinds))
+        names = chain.from_iterable(map(_names, self.kinds))
         return [CompletionItem(before + comma + name) for name in names if name.startswith(last)]
 
 
@@ -271,14 +285,35 @@ def plain_path(text: str) -> Path:
 
 
 class _PathType(Converted):
-    """The type of a path, which shells complete as they do files."""
+    """The type of a path, which shells complete as they do files; if `written`, of an output."""
+
+    def __init__(self, metavar: str, *, written: bool = False) -> None:
+        super().__init__(plain_path, metavar)
+        self.written = written
 
     def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
         return click.Path().shell_complete(ctx, param, incomplete)
 
 
-DIRECTORY: Final = _PathType(plain_path, "DIR")
-FILE: Final = _PathType(plain_path, "FILE")
+def is_output(parameter: click.Parameter) -> bool:
+    """Tell whether a command writes at the path that an option or argument names."""
+    return isinstance(parameter.type, _PathType) and parameter.type.written
+
+
+def _paths(parameter: click.Parameter, value: Any) -> Iterator[Path]:
+    """Yield the paths that a command reads by an option or argument."""
+    kind = parameter.type
+    if isinstance(kind, _PathType | click.Path):
+        yield from map(Path, value if isinstance(value, tuple) else (value,))
+    elif isinstance(kind, Names) and "splits" in kind.kinds:
+        with contextlib.suppress(OoddError):  # no split: the command says so
+            yield load("oodd_eval.data.split:load_split")(value).path
+
+
+DIRECTORY: Final = _PathType("DIR")
+FILE: Final = _PathType("FILE")
+OUTPUT_DIRECTORY: Final = _PathType("DIR", written=True)
+OUTPUT_FILE: Final = _PathType("FILE", written=True)
 COUNT: Final = _named(click.IntRange(min=1), "N")
 HORIZONS: Final = Converted(partial(whole_numbers, least=1), "N,...")
 SEEDS: Final = Converted(partial(whole_numbers, least=0), "N,...")

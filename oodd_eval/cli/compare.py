@@ -2,14 +2,24 @@
 
 import contextlib
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Final
 
 import click
 
-from oodd_eval.cli import FILE, Name, Names, Options, command, expression_option, refuse, say
+from oodd_eval.cli import (
+    FILE,
+    OUTPUT_FILE,
+    Name,
+    Names,
+    Options,
+    command,
+    expression_option,
+    refuse,
+    say,
+)
 from oodd_eval.cli.console import make_console
-from oodd_eval.errors import OutputError, ResultsError, UnknownNameError, UsageError
+from oodd_eval.data.files import write_text
+from oodd_eval.errors import ResultsError, UnknownNameError, UsageError
 from oodd_eval.metrics.catalogue import NAMES
 from oodd_eval.names import counted, expression, select
 from oodd_eval.prose import print_prose, print_table
@@ -51,11 +61,11 @@ LOG_WIDTH: Final = 160
     help="compare cells, means over a group of anomalies in an environment, or means of all cells",
 )
 @expression_option
-@click.option("--junit", type=FILE, help="write JUnit XML, a test case per cell and metric")
-@click.option("--markdown", type=FILE, help="write Markdown, for a pull request")
+@click.option("--junit", type=OUTPUT_FILE, help="write JUnit XML, a test case per cell and metric")
+@click.option("--markdown", type=OUTPUT_FILE, help="write Markdown, for a pull request")
 @click.option(
     "--write-reference",
-    type=FILE,
+    type=OUTPUT_FILE,
     help="write records to compare with later (compressed: .xz, .gz)",
 )
 @click.option("--keep", type=Names("metrics"), help="keep only these metrics, with their intervals")
@@ -83,7 +93,6 @@ def compare(options: Options) -> int:
     code = 0
     if options.against:
         code = _compare(now, read_record_set(options.against).selected(passes), options)
-    # Last, so that a file can be compared with and then replaced.
     if options.write_reference:
         if not now.records:
             return say(f"no record of {options.results} is selected: no reference written", 5)
@@ -138,9 +147,9 @@ def _compare(now: RecordSet, reference: RecordSet, options: Options) -> int:
     except regression.NothingInCommonError as error:
         return say(str(error), 5)
     if options.junit:
-        _write(options.junit, junit(comparison))
+        write_text(options.junit, junit(comparison))
     if options.markdown:
-        _write(options.markdown, markdown_section(comparison_section(comparison)))
+        write_text(options.markdown, markdown_section(comparison_section(comparison)))
     console = make_console()
     section = comparison_section(comparison, everything=options.verbosity > 0)
     if options.verbosity >= 0:
@@ -154,10 +163,3 @@ def _compare(now: RecordSet, reference: RecordSet, options: Options) -> int:
     if comparison.failures and options.verbosity >= 0:
         print_prose(section.title, console, "bold red")
     return int(bool(comparison.failures))
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"{str(path)!r} cannot be written: {error.strerror}") from None

@@ -5,7 +5,7 @@ from typing import Final
 
 import click
 
-from oodd_eval.cli import DIRECTORY, Name, Options, command
+from oodd_eval.cli import OUTPUT_DIRECTORY, Name, Options, command
 from oodd_eval.cli.console import make_console
 from oodd_eval.data.description import describe
 from oodd_eval.data.fetch import fetch as fetch_split
@@ -15,7 +15,9 @@ from oodd_eval.names import counted
 from oodd_eval.scoring.promises import promises_of
 
 output_option: Final = click.option(
-    "--output", type=DIRECTORY, help="directory of the split (default: where splits are found)"
+    "--output",
+    type=OUTPUT_DIRECTORY,
+    help="directory of the split (default: where splits are found)",
 )
 split_argument: Final = click.argument(
     "name", type=Name("splits"), metavar="SPLIT", help="name or path of a split"

@@ -2,14 +2,14 @@
 
 import click
 
-from oodd_eval.cli import DIRECTORY, Options, command, expression_option, say
+from oodd_eval.cli import OUTPUT_DIRECTORY, Options, command, expression_option, say
 from oodd_eval.errors import UsageError
 from oodd_eval.names import counted, expression
 from oodd_eval.results.directory import ResultsDirectory
 
 
 @command("forget oodd-results --failed", "forget oodd-results -k 'riqn and hopper'")
-@click.argument("directory", type=DIRECTORY, help="results directory")
+@click.argument("directory", type=OUTPUT_DIRECTORY, help="results directory")
 @expression_option
 @click.option("--failed", is_flag=True, help="only cells that failed")
 def forget(options: Options) -> int:

@@ -11,9 +11,9 @@ from rich.console import Console
 
 from oodd_eval.cli import (
     COUNT,
-    DIRECTORY,
     FILE,
     NAMES,
+    OUTPUT_DIRECTORY,
     SEEDS,
     Command,
     Name,
@@ -98,7 +98,7 @@ class _Configurable(Command):
 @alarm_options
 @row_metrics_option
 @click.option("--config", type=FILE, help="TOML file with these options by their long names")
-@click.option("--output", default="oodd-results", type=DIRECTORY, help="results directory")
+@click.option("--output", default="oodd-results", type=OUTPUT_DIRECTORY, help="results directory")
 def run(options: Options) -> int:
     """Fit and score every selected cell, print the tables and write the results.
 

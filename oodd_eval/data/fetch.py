@@ -20,12 +20,12 @@ import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path, PurePosixPath
 from typing import Any, Final, NamedTuple, Self
-from urllib.parse import quote, urlsplit
+from urllib.parse import SplitResult, quote, urlsplit
 from urllib.request import url2pathname
 
 from oodd_eval._version import __version__
 from oodd_eval.data.bounded import MANIFEST_BYTES
-from oodd_eval.data.files import lock, temporary_directory
+from oodd_eval.data.files import lies_in, lock, temporary_directory
 from oodd_eval.data.layout import MANIFEST, read_manifest
 from oodd_eval.data.split import SHIPPED, Split, data_home
 from oodd_eval.errors import DigestError, OutputError, SplitError, SplitNotFoundError, UsageError
@@ -88,7 +88,7 @@ def fetch(
                 raise OutputError(f"another process is fetching the same into {str(home)!r}; wait")
             try:
                 with _open_source(address, staging / "archive") as source:
-                    fetched = _bring(source, staging, output, digest, progress)
+                    fetched = _bring(source, staging, output, digest, progress, _parsed(address)[1])
                 shutil.rmtree(staging, ignore_errors=True)
             finally:
                 # Files beside the manifest are work that a later fetch goes on from.
@@ -105,7 +105,12 @@ def fetch(
 
 
 def _bring(
-    source: Source, staging: Path, output: Path | None, digest: str | None, progress: Progress
+    source: Source,
+    staging: Path,
+    output: Path | None,
+    digest: str | None,
+    progress: Progress,
+    origin: Path,
 ) -> Fetched:
     (staging / MANIFEST).unlink(missing_ok=True)
     source(MANIFEST, staging / MANIFEST, MANIFEST_BYTES)
@@ -124,6 +129,11 @@ def _bring(
     target = output or data_home() / name
     if present := _installed(name, target, actual, by_name=output is None):
         return Fetched(present, already=True)
+    if target.exists() and lies_in(origin, target):
+        raise UsageError(
+            f"{str(target)!r} is a damaged copy that would be replaced, with {str(origin)!r} in "
+            "it: move that elsewhere, and fetch it there"
+        )
     fresh = staging / actual
     fresh.mkdir(exist_ok=True)
     shutil.copy(staging / MANIFEST, fresh)
@@ -188,14 +198,7 @@ def _bring_file(
 @contextlib.contextmanager
 def _open_source(address: str, archive: Path) -> Iterator[Source]:
     """Give the files at an address; an archive on the web is downloaded to `archive` first."""
-    try:
-        parts = urlsplit(address)
-    except ValueError as error:
-        raise UsageError(
-            f"{_plain(address)} is no address ({error}): expected such as "
-            "https://example.org/split.tar"
-        ) from None
-    path = Path(url2pathname(parts.path)) if parts.scheme == "file" else Path(address)
+    parts, path = _parsed(address)
     if parts.scheme in {"http", "https"}:
         if not parts.path.endswith(ARCHIVES):
             folder = address.rstrip("/")
@@ -219,6 +222,18 @@ def _open_source(address: str, archive: Path) -> Iterator[Source]:
         raise SplitNotFoundError(
             f"there is nothing at {address}: expected a directory, file or URL"
         )
+
+
+def _parsed(address: str) -> tuple[SplitResult, Path]:
+    """Return the parts of an address, and its path if it is one of this machine."""
+    try:
+        parts = urlsplit(address)
+    except ValueError as error:
+        raise UsageError(
+            f"{_plain(address)} is no address ({error}): expected such as "
+            "https://example.org/split.tar"
+        ) from None
+    return parts, Path(url2pathname(parts.path)) if parts.scheme == "file" else Path(address)
 
 
 def _copy_from(directory: Path, name: str, target: Path, most: int) -> None:

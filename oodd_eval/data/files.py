@@ -13,14 +13,14 @@ import shutil
 import sys
 import tempfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any, Final
 
 import psutil
 
 from oodd_eval.data.bounded import read_bytes
-from oodd_eval.errors import OutputError, ResultsError
+from oodd_eval.errors import OutputError, ResultsError, UsageError
 
 GZIP: Final = ".gz"
 XZ: Final = ".xz"
@@ -122,6 +122,51 @@ def write_bytes(path: Path, content: bytes) -> None:
 def write_text(path: Path, text: str) -> None:
     """Write UTF-8 text with line feeds in one step, see `replacing`."""
     write_bytes(path, text.encode())
+
+
+def refuse_inputs(output: Path, inputs: Iterable[Path], option: str = "output") -> None:
+    """Raise `UsageError` when writing an output would overwrite an input, under any of its names.
+
+    A file overwrites an input that it is, and nothing in a directory that is read. A directory is
+    no input itself. It may hold directories that are read, and TOML, which nothing is written over.
+    """
+    written = _file_id(output)
+    for path in inputs if written else ():
+        if written == _file_id(path):
+            overwritten = f"the input {str(path)!r}"
+        elif (
+            output.is_dir() and path.is_file() and path.suffix != ".toml" and lies_in(path, output)
+        ):
+            overwritten = f"the input {str(path)!r} in it"
+        elif output.is_file() and path.is_dir() and _has_file(path, output):
+            overwritten = f"a file of the input {str(path)!r}"
+        else:
+            continue
+        raise UsageError(
+            f"{option} {str(output)!r} would overwrite {overwritten}, and nothing was written: "
+            "expected a path that is not read, choose another name"
+        )
+
+
+def lies_in(path: Path, directory: Path) -> bool:
+    """Tell whether a path, or what it links to, is a directory or below it."""
+    names = (path.resolve(), path.parent.resolve() / path.name)
+    above = {_file_id(folder) for name in names for folder in (name, *name.parents)}
+    return _file_id(directory) in above - {None}
+
+
+def _has_file(directory: Path, path: Path) -> bool:
+    """Tell whether a file is in a directory, by its own path or as the target of a link there."""
+    return lies_in(path, directory) or _file_id(path) in map(_file_id, directory.rglob("*"))
+
+
+def _file_id(path: Path) -> tuple[int, int] | None:
+    """Return device and inode of what a path leads to; None where there is nothing."""
+    try:
+        status = path.stat()
+    except (OSError, ValueError):
+        return None
+    return status.st_dev, status.st_ino
 
 
 def remove_abandoned(directory: Path, name: str = "*") -> None:

@@ -6,6 +6,7 @@ import click
 
 from oodd_eval.cli import (
     DIRECTORY,
+    OUTPUT_DIRECTORY,
     TIME,
     Name,
     Options,
@@ -18,6 +19,7 @@ from oodd_eval.cli import (
 from oodd_eval.cli.console import make_console
 from oodd_eval.cli.plugins import discovered
 from oodd_eval.data.facts import PROTOCOL, SPLITS
+from oodd_eval.data.files import refuse_inputs
 from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import MissingExtraError, SplitNotFoundError, UsageError
 from oodd_eval.names import check_known, counted, select
@@ -51,7 +53,7 @@ _OF_RUNS: Final = (
 )
 @click.option("--split", type=Name("splits"), help="name or path of a split (default: the tier's)")
 @click.option(
-    "--output", default="reproduction", type=DIRECTORY, help="directory of the reproduction"
+    "--output", default="reproduction", type=OUTPUT_DIRECTORY, help="directory of the reproduction"
 )
 @click.option(
     "--only",
@@ -107,6 +109,7 @@ def _run(options: Options) -> int:
     experiments = [e for e in EXPERIMENTS if e.id in names]
     plugins = discovered(options)
     split = _split(options)
+    refuse_inputs(options.output, [split.path], "--output")
     tier, definition = TIERS[options.tier], split.manifest["definition"]
     sizes = {part: int(definition[part]) for part in ("train", "calibration", "test")}
     units = len(lay_out(EXPERIMENTS, tier, split, plugins))

@@ -15,8 +15,9 @@ from oodd_checks.conformance import CheckReport, Result
 
 from oodd_eval.cli import (
     COUNT,
-    DIRECTORY,
     FILE,
+    OUTPUT_DIRECTORY,
+    OUTPUT_FILE,
     Converted,
     Name,
     Names,
@@ -104,7 +105,9 @@ def _strengths(text: str) -> list[tuple[str, float]]:
 @click.option("--policy", type=FILE, help="policy file of the one --env (default: its own)")
 @jobs_option
 @click.option(
-    "--output", type=DIRECTORY, help="directory of the split (default: where splits are found)"
+    "--output",
+    type=OUTPUT_DIRECTORY,
+    help="directory of the split (default: where splits are found)",
 )
 def build(options: Options) -> int:
     """Record a split, which needs the extra sim; what an earlier call has recorded is kept."""
@@ -210,8 +213,8 @@ def _definition(options: Options) -> SplitDefinition:
     help="measure robots on whole episodes, and only the rung of the paper's Table 2 (default: "
     "episodes of at most 300 steps, all rungs)",
 )
-@click.option("--output", required=True, type=FILE, help="strengths, as JSON")
-@click.option("--work", type=FILE, help="measured returns (default: OUTPUT.work)")
+@click.option("--output", required=True, type=OUTPUT_FILE, help="strengths, as JSON")
+@click.option("--work", type=OUTPUT_FILE, help="measured returns (default: OUTPUT.work)")
 @jobs_option
 def calibrate(options: Options) -> int:
     """Find the strengths of a ladder; what an earlier call has measured is kept.
@@ -251,7 +254,7 @@ def calibrate(options: Options) -> int:
     help="kinds of anomalies (default: those of the environment's ladder, and those of plug-ins "
     "that can be recorded in it)",
 )
-@click.option("--output", default="pages", type=DIRECTORY, help="directory of the page")
+@click.option("--output", default="pages", type=OUTPUT_DIRECTORY, help="directory of the page")
 def page(options: Options) -> int:
     """Write a page on an environment, as Markdown with pictures.
 
@@ -270,7 +273,9 @@ def page(options: Options) -> int:
 
 @command("policies train hopper --steps 200000", plugins=True)
 @_environment_argument
-@click.option("--output", default="policies", type=DIRECTORY, help="checkpoint and best policy")
+@click.option(
+    "--output", default="policies", type=OUTPUT_DIRECTORY, help="checkpoint and best policy"
+)
 @click.option("--steps", type=_SIZE, help="environment steps in all")
 @click.option("--seed", type=int, default=1, help="seed of the training")
 def train(options: Options) -> int:
@@ -291,7 +296,7 @@ def train(options: Options) -> int:
 @command("policies import actor.onnx --env hopper --output hopper.npz", plugins=True)
 @click.argument("path", type=FILE, metavar="FILE.onnx")
 @click.option("--env", required=True, type=Name("envs"), help="environment in which it acts")
-@click.option("--output", required=True, type=FILE, help="policy file, .npz or .onnx")
+@click.option("--output", required=True, type=OUTPUT_FILE, help="policy file, .npz or .onnx")
 @click.option("--tensor", default="", help="the graph's output with actions (default: the first)")
 def import_policy(options: Options) -> int:
     """Take a policy over from an ONNX file, and try it in its environment.

@@ -319,7 +319,10 @@ def test_a_regression_is_exit_code_1_and_a_table(run):
         ("same --against same --fail auc:1 --fail auc:2", "two tolerances"),
         ("same", "nothing to do"),
         ("same --against same --by x", "'x'"),
-        ("same --against same --junit no/j.xml", "'no/j.xml' cannot be written"),
+        (
+            "same --against same --junit reference.jsonl/j.xml",
+            "'reference.jsonl/j.xml' cannot be written",
+        ),
     ],
 )
 def test_what_cannot_be_done_is_exit_code_4(run, arguments, message):
@@ -341,7 +344,8 @@ def test_a_reference_is_written_of_the_selected_cells_and_replaced(run):
     assert run("worse", "--against", "new.json", "--fail", "auc:0.5")[0] == 0
     assert "1 new cell is not in the reference" in run("same", "--against", "new.json")[1]
     again = ("--against", "reference.jsonl", "--fail", "auc:-0.01")
-    assert run("worse", *again, "--write-reference", "reference.jsonl")[0] == 1
+    assert run("worse", *again, "--write-reference", "reference.jsonl")[0] == 4  # it is read
+    assert run("worse", "--write-reference", "reference.jsonl")[0] == 0
     assert run("worse", *again)[0] == 0
 
 

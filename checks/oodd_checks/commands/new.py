@@ -6,14 +6,14 @@ from pathlib import Path
 import click
 
 from oodd_checks.template import Project, write_project
-from oodd_eval.cli import DIRECTORY, Options, command
+from oodd_eval.cli import OUTPUT_DIRECTORY, Options, command
 from oodd_eval.errors import UsageError
 from oodd_eval.plugins.discovery import discover
 
 
 @command("new my-detector", plugins=True)
 @click.argument("name", help="name of the detector: lower-case letters, digits, hyphens")
-@click.option("--output", type=DIRECTORY, help="where to write it (default: oodd-NAME)")
+@click.option("--output", type=OUTPUT_DIRECTORY, help="where to write it (default: oodd-NAME)")
 def new(options: Options) -> int:
     """Write a plug-in project that works before anything in it is edited.
 

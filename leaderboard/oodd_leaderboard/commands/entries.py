@@ -10,7 +10,17 @@ from typing import Final, NamedTuple
 import click
 from rich.console import Console
 
-from oodd_eval.cli import DIRECTORY, NAMES, Name, Names, Options, command, expression_option, say
+from oodd_eval.cli import (
+    DIRECTORY,
+    NAMES,
+    OUTPUT_DIRECTORY,
+    Name,
+    Names,
+    Options,
+    command,
+    expression_option,
+    say,
+)
 from oodd_eval.cli.console import make_console
 from oodd_eval.data.files import only_writer, temporary_directory
 from oodd_eval.errors import UsageError
@@ -36,7 +46,7 @@ _split_option: Final = click.option(
 
 @command("leaderboard build --check")
 @click.argument("results", default=RESULTS, type=DIRECTORY, help="directory of the entries")
-@click.option("--output", default="leaderboard", type=DIRECTORY, help="where to write")
+@click.option("--output", default="leaderboard", type=OUTPUT_DIRECTORY, help="where to write")
 @click.option(
     "--check", is_flag=True, help="write nothing, exit 1 where a file beside the site would change"
 )
@@ -81,7 +91,7 @@ def part_shown(*, quiet: bool) -> Iterator[Callable[[str], object]]:
 
 @command("leaderboard submit oodd-results --id mine --title 'My detector'", repeated=["--primary"])
 @click.argument("directory", type=DIRECTORY, help="results of oodd-eval run or reproduce")
-@click.option("--results", default=RESULTS, type=DIRECTORY, help="directory of the entries")
+@click.option("--results", default=RESULTS, type=OUTPUT_DIRECTORY, help="directory of the entries")
 @click.option("--detector", "detectors", default="all", type=Names("detectors"), help=NAMES)
 @expression_option
 @click.option("--complete", is_flag=True, help="leave out seeds of a row that lack cells")

@@ -2,7 +2,7 @@
 
 import click
 
-from oodd_eval.cli import DIRECTORY, Names, Options, command
+from oodd_eval.cli import OUTPUT_DIRECTORY, Names, Options, command
 from oodd_eval.cli.console import make_console
 from oodd_eval.cli.data import split_argument
 from oodd_eval.data.split import load_split
@@ -15,7 +15,7 @@ from oodd_logs.minari_files import export as export_split
 @click.option(
     "--format", required=True, type=click.Choice(["minari"]), help="minari: one dataset a part"
 )
-@click.option("--output", required=True, type=DIRECTORY, help="root of the datasets")
+@click.option("--output", required=True, type=OUTPUT_DIRECTORY, help="root of the datasets")
 @click.option("--env", default="all", type=Names("envs"), help="only these environments")
 def export(options: Options) -> int:
     """Write a split in another project's format."""

@@ -6,14 +6,14 @@ from typing import Final
 
 import click
 
-from oodd_eval.cli import FILE, PARAMETER, Options, command
+from oodd_eval.cli import FILE, OUTPUT_FILE, PARAMETER, Options, command
 from oodd_eval.cli.console import make_console
 from oodd_eval.data.files import write_text
 from oodd_eval.errors import OutputError
 from oodd_eval.prose import print_prose
 from oodd_logs.commands.reader_plugins import register_formats
 from oodd_logs.inspection.draft import draft
-from oodd_logs.inspection.logs import Inspection, inspect_logs
+from oodd_logs.inspection.logs import Inspection, inspect_logs, refuse_logs
 from oodd_logs.inspection.meaning import sensors_of, window_of
 from oodd_logs.inspection.report import describe_logs
 from oodd_logs.scanning.limits import FITS, SHORTEST, WINDOWS
@@ -33,7 +33,7 @@ _NO_SENSOR: Final = (
     plugins=True,
 )
 @click.argument("path", type=FILE)
-@click.option("--recipe", type=FILE, help="write a first recipe there, for `data import`")
+@click.option("--recipe", type=OUTPUT_FILE, help="write a first recipe there, for `data import`")
 @click.option("--format", metavar="NAME", help="of the files (default: by their endings)")
 @click.option(
     "--read", multiple=True, type=PARAMETER, help="an option of the format; V is JSON or text"
@@ -48,6 +48,7 @@ def inspect(options: Options) -> int:
     console = make_console(quiet=options.verbosity < 0)
     if options.recipe and options.recipe.exists():
         raise OutputError(f"{str(options.recipe)!r} exists: remove it, or choose another name")
+    refuse_logs([options.recipe], options.path, options.format)
     logs = inspect_logs(
         options.path,
         options.format or "",

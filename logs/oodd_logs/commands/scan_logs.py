@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Iterator, Sequence
+from itertools import product
 from typing import Final
 
 import click
@@ -11,13 +12,15 @@ from oodd_live.watchdog import Watchdog
 from rich.text import Text
 from tabulate import tabulate
 
-from oodd_eval.cli import COUNT, FILE, PARAM, PARAMETER, Name, Options, command, refuse
+from oodd_eval.cli import COUNT, FILE, OUTPUT_FILE, PARAM, PARAMETER, Name, Options, command, refuse
 from oodd_eval.cli.console import make_console
-from oodd_eval.data.files import write_text
+from oodd_eval.data.files import refuse_inputs, write_text
 from oodd_eval.names import counted
 from oodd_eval.plugins.parameters import parameters_by_detector
 from oodd_eval.prose import print_prose
 from oodd_logs.commands.reader_plugins import register_formats
+from oodd_logs.episodes import files_of
+from oodd_logs.inspection.logs import refuse_logs
 from oodd_logs.recipe import Recipe
 from oodd_logs.scanning.logs import read_logs
 from oodd_logs.scanning.scan import SCANNER, Scan, scan_episodes
@@ -59,10 +62,12 @@ _NEXT: Final = 10  # of more, the nominal ones that it has beside the odd ones
     "--fdr", default=0.1, type=_SHARE, help="share of nominal ones among those called odd, at most"
 )
 @click.option("--jobs", default=1, type=COUNT, help="fits at a time")
-@click.option("--json", type=FILE, help="write everything as JSON")
-@click.option("--html", type=FILE, help="write a page with a picture of each odd episode")
-@click.option("--rerun", type=FILE, help="write a recording for Rerun, .rrd (extra viewers)")
-@click.option("--mcap", type=FILE, help="write MCAP, for Foxglove and others (extra viewers)")
+@click.option("--json", type=OUTPUT_FILE, help="write everything as JSON")
+@click.option("--html", type=OUTPUT_FILE, help="write a page with a picture of each odd episode")
+@click.option("--rerun", type=OUTPUT_FILE, help="write a recording for Rerun, .rrd (extra viewers)")
+@click.option(
+    "--mcap", type=OUTPUT_FILE, help="write MCAP, for Foxglove and others (extra viewers)"
+)
 def scan(options: Options) -> int:
     """Tell which recorded episodes are odd, and which of their rows and sensors.
 
@@ -79,6 +84,11 @@ def scan(options: Options) -> int:
     recipe = Recipe.load(options.recipe) if options.recipe else None
     home = options.recipe.parent if options.recipe else None
     form, read = options.format or "", dict(options.read)
+    outputs = [path for path in (options.json, options.html, options.rerun, options.mcap) if path]
+    for path, root in product(outputs, (options.logs, home)):
+        if recipe and root:
+            refuse_inputs(path, files_of(recipe, root))
+    refuse_logs(outputs, options.logs, recipe.format if recipe else form)
     logs = read_logs(options.logs, recipe, form, read, options.window, home)
     parameters = parameters_by_detector([options.detector], dict(options.param))
     result = scan_episodes(

@@ -3,7 +3,7 @@
 import hashlib
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -11,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from oodd_eval.data.files import lies_in
 from oodd_eval.errors import TrajectoryError, UsageError
 from oodd_eval.names import check_known
 from oodd_logs.inspection.columns import FEW, ClockFacts, ColumnFacts, parse_dates, time_unit
@@ -355,6 +356,26 @@ def recognised(path: Path, form: str) -> tuple[Reader, list[Path], Counter[str]]
     name = max(by_reader, key=lambda reader: len(by_reader[reader]))
     left_out = {*files} - {*by_reader[name]}
     return formats[name], by_reader[name], Counter(file.suffix for file in left_out)
+
+
+def refuse_logs(outputs: Iterable[Path | None], logs: Path, form: str | None) -> None:
+    """Raise `UsageError` for an output in a folder of logs that would be read as one the next time.
+
+    Parameters
+    ----------
+    outputs
+        Files to write; None for those that were not asked for.
+    logs, form
+        The logs, and their format if it is said.
+    """
+    written = [path for path in outputs if path and lies_in(path, logs)]
+    reader = recognised(logs, form or "")[0] if written else None
+    for path in written:
+        if reader and reader.fits(path):
+            raise UsageError(
+                f"{str(path)!r} would be one of the logs in {str(logs)!r} the next time, as "
+                f"{reader.part}: expected a path elsewhere, choose another folder"
+            )
 
 
 def _continued(recordings: Sequence[RecordingFacts]) -> list[tuple[str, str, int]]:

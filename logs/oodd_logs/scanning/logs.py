@@ -1,6 +1,5 @@
 """Logs as a scan reads them: every episode in recorded order, labelled or not."""
 
-import itertools
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -79,11 +78,8 @@ def read_logs(
     if window is not None:
         recipe = replace(recipe, window=window, nominal=replace(recipe.nominal, window=None))
     if home is not None and files[0].is_relative_to(home):
-        nominal = recipe.nominal
-        listed = [nominal.files, nominal.train, nominal.calibration, nominal.test, nominal.twins]
-        listed += [table.files for table in recipe.anomalous.values()]
-        if not any(names_matching(pattern, root) for pattern in itertools.chain(*listed)):
-            root = home
+        listed = any(names_matching(pattern, root) for pattern in recipe.globs)
+        root = root if listed else home
     with read_every_episode(recipe, root, files) as source:
         return RecordedLogs(
             list(source.episodes(EVERY)),
