@@ -12,6 +12,7 @@ import pytest
 
 from oodd_checks.conformance.trial import Trial
 from oodd_eval.data.facts import PROTOCOL
+from oodd_eval.data.files import refuse_inputs
 from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import OoddError, UnknownNameError, UsageError
 from oodd_eval.metrics.catalogue import NAMES
@@ -68,6 +69,9 @@ class Cells:
         names = _detectors(option("oodd_detector"), self.plugins)
         self.split = load_split(option("oodd_split"))
         environments = select("environment", option("oodd_env") or "all", self.split.environments)
+        if output := option("oodd_output"):
+            read = [self.split.path, Path(option("oodd_reference") or self.split.path)]
+            refuse_inputs(Path(output), read, "--oodd-output")
         self.reference = None
         if path := option("oodd_reference"):
             self.reference = _comparable(read_record_set(path), self.split, names, environments)

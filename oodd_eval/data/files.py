@@ -127,8 +127,8 @@ def write_text(path: Path, text: str) -> None:
 def refuse_inputs(output: Path, inputs: Iterable[Path], option: str = "output") -> None:
     """Raise `UsageError` when writing an output would overwrite an input, under any of its names.
 
-    A file overwrites an input that it is, and nothing in a directory that is read. A directory is
-    no input itself. It may hold directories that are read, and TOML, which nothing is written over.
+    No output replaces a file of a directory that is read. A directory to write in may hold such
+    directories, and TOML files, which no command writes there, but no other input.
     """
     written = _file_id(output)
     for path in inputs if written else ():

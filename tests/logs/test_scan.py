@@ -628,7 +628,9 @@ def test_command_on_a_folder(tmp_path, capsys):
     episodes[7][60:75, 0] = np.nan
     write_logs(tmp_path / "logs", episodes)
     command = ["scan", str(tmp_path / "logs"), "--detector=mewma"]
-    outputs = {kind: tmp_path / f"out/scan.{kind}" for kind in ("json", "html", "mcap")}
+    read = {file: (file.stat(), file.read_bytes()) for file in (tmp_path / "logs").iterdir()}
+    outputs = {kind: tmp_path / f"out/scan.{kind}" for kind in ("json", "mcap")}
+    outputs["html"] = tmp_path / "logs/scan.html"  # a new file, of no format of logs
     options = [f"--{kind}={path}" for kind, path in outputs.items()]
     assert main([*command, *options]) == 1
     out = capsys.readouterr().out
@@ -641,6 +643,9 @@ def test_command_on_a_folder(tmp_path, capsys):
     assert outputs["mcap"].stat().st_size
     assert main([*command, "-q"]) == 1
     assert capsys.readouterr().out.count("\n") == 1
+    for file, (status, content) in read.items():
+        assert (file.read_bytes(), file.stat().st_mtime_ns) == (content, status.st_mtime_ns)
+    assert {*(tmp_path / "logs").iterdir()} == {*read, outputs["html"]}
 
 
 def test_of_many_episodes_the_table_has_the_oddest(tmp_path, capsys):
