@@ -214,6 +214,8 @@ def test_files_that_a_recipe_names_are_inputs(recipe, tmp_path, capsys):
         assert "would overwrite" in capsys.readouterr().err
     assert main(["data", "import", str(recipe), "--root", str(logs)]) == 4
     assert "arm.h5' would overwrite the input" in capsys.readouterr().err
+    assert main(["data", "import", str(recipe), "--output", str(tmp_path)]) == 4
+    assert f"--output '{tmp_path}' would overwrite the input" in capsys.readouterr().err
     assert contents(tmp_path) == before
 
 

@@ -10,6 +10,7 @@ from oodd_eval.cli import COUNT, DIRECTORY, Converted, Options, command
 from oodd_eval.cli.console import make_console
 from oodd_eval.cli.data import output_option
 from oodd_eval.data.facts import Quantity
+from oodd_eval.data.files import refuse_inputs
 from oodd_eval.errors import UsageError
 from oodd_eval.names import assignment
 from oodd_eval.prose import print_prose
@@ -83,8 +84,10 @@ def import_logs(options: Options) -> int:
             raise UsageError(f"--root is missing: the folder with the files of {options.name}")
         path = shipped or Path(options.name)
         recipe = Recipe.load(path)
-        environment = recipe.environment
-        split = import_recipe(recipe, options.root or path.parent, **say)
+        environment, root = recipe.environment, options.root or path.parent
+        if options.output:
+            refuse_inputs(options.output, [root], "--output")
+        split = import_recipe(recipe, root, **say)
     else:
         if lacking := [name for name in _REQUIRED if name not in keys]:
             raise UsageError(
