@@ -368,18 +368,21 @@ def groups(sizes: Mapping[str, int]) -> list[list[Member]]:
 def mixed(sizes: Mapping[str, int]) -> list[list[Member]]:
     """Return the trajectories of parts, by their number, in groups that hold some of all parts.
 
-    The episodes of one test seed are in different groups, drawn at random in every run. So nothing
-    that tells a group, such as the time since the fit, says which of its episodes are anomalous.
+    There are as many groups as test parts. The episodes of one test seed are in different groups,
+    which are drawn at random in every run, as is the order in a group. So nothing that tells a
+    group or a place in it, such as the time since the fit, says which episodes are anomalous.
     """
+    random = secrets.SystemRandom()
     calibration = [Member(CALIBRATION, i) for i in range(sizes.get(CALIBRATION, 0))]
-    tests = {part: n for part, n in sizes.items() if part != CALIBRATION}
-    seeds = max(tests.values(), default=0) or len(calibration)
-    rows = [
-        [Member(part, i) for part, n in tests.items() if i < n] + calibration[i::seeds]
-        for i in range(seeds)
-    ]
-    drawn: list[list[Member]] = [[] for _ in range(max(map(len, rows), default=0))]
+    tests = {part: n for part, n in sizes.items() if part != CALIBRATION and n}
+    drawn: list[list[Member]] = [[] for _ in tests or [CALIBRATION]]
+    seeds = range(max(tests.values(), default=0))
+    rows = [[Member(part, i) for part, n in tests.items() if i < n] for i in seeds]
+    size = len(drawn)
+    rows += [calibration[i : i + size] for i in range(0, len(calibration), size)]
     for row in rows:
-        for group, member in zip(secrets.SystemRandom().sample(drawn, len(row)), row, strict=True):
+        for group, member in zip(random.sample(drawn, len(row)), row, strict=True):
             group.append(member)
+    for group in drawn:
+        random.shuffle(group)
     return [group for group in drawn if group]

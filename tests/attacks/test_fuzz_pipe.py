@@ -41,7 +41,7 @@ FIT = st.fixed_dictionaries(
 )  # fmt: skip
 STATE = st.fixed_dictionaries({"names": st.lists(st.text()) | ANY, "text": st.text() | ANY})
 NAMES = st.sampled_from(["status", "reason", "seconds_score", "peak_rss_mb", "seconds_fit",
-                         "warm_up", "explains", "updates", "forks", "state"])  # fmt: skip
+                         "warm_up", "explains", "updates", "forks", "state", "streams"])  # fmt: skip
 KNOWN = st.sampled_from(["error", "ok", "oom", "timeout", 0, 1.5, True])
 MESSAGE = FIT | STATE | st.dictionaries(NAMES, KNOWN | ANY, max_size=4) | ANY
 JSON = MESSAGE.map(lambda message: json.dumps(message).encode())
@@ -68,7 +68,12 @@ GOOD = [
 ]  # fmt: skip
 PREFIX = b"".join(framed(json.dumps(message).encode()) for message in GOOD)
 TALK = st.lists(FRAME, max_size=6).map(b"".join)
-TALKS = TALK | damaged(TALK) | TALK.map(PREFIX.__add__) | saved().map(lambda a: PREFIX + framed(a))
+ROWS = st.lists(st.binary(max_size=20).map(b"=".__add__).map(framed), max_size=3).map(b"".join)
+STREAMS = framed(b'{"streams": 2}')
+TALKS = (
+    TALK | damaged(TALK) | TALK.map(PREFIX.__add__) | saved().map(lambda a: PREFIX + framed(a))
+    | ROWS.map(lambda rows: PREFIX + STREAMS + rows)
+)  # fmt: skip
 
 
 def child_of(descriptor):

@@ -196,11 +196,11 @@ def test_a_wrong_state(converse, state):
 
 def test_rows_are_answered_one_by_one(converse):
     scores = np.arange(ROWS, dtype="<f8")
-    sent = [frame(score.tobytes()) for score in scores]
+    sent = [said({"streams": 1}), *(frame(b"=" + score.tobytes()) for score in scores)]
     out = converse(said(FITTED), *sent, said(SCORED), streamed=True, stay=30)
     assert (out.status, out.reason) == ("ok", "")
     assert np.array_equal(out.scores[0], scores)
-    out = converse(said(FITTED), sent[0], sent[1][:-3], streamed=True)
+    out = converse(said(FITTED), *sent[:2], sent[2][:-3], streamed=True)
     assert (out.status, "ended with exit code 0" in out.reason) == ("error", True)
 
 
@@ -208,7 +208,9 @@ def test_rows_are_answered_one_by_one(converse):
     ("said_instead", "status", "reason"),
     [
         (said(SCORED), "error", GARBLED),
-        (frame(bytes(7)), "error", GARBLED),
+        (frame(bytes(9)), "error", GARBLED),
+        (frame(b"=" + bytes(7)), "error", GARBLED),
+        (frame(b"=" + bytes(16)), "error", GARBLED),
         (frame(b""), "error", GARBLED),
         (b"", "error", "the worker ended with exit code 0 while scoring"),
         (said({"status": "invalid", "reason": "why"}), "invalid", "why"),
@@ -216,8 +218,15 @@ def test_rows_are_answered_one_by_one(converse):
 )
 def test_a_failure_in_place_of_a_score_says_why(converse, said_instead, status, reason):
     stay = 30 if said_instead else 0
-    out = converse(said(FITTED), frame(bytes(8)), said_instead, streamed=True, stay=stay)
+    first = said({"streams": 1}), frame(b"=" + bytes(8))
+    out = converse(said(FITTED), *first, said_instead, streamed=True, stay=stay)
     assert (out.status, out.reason) == (status, reason)
+
+
+@pytest.mark.parametrize("streams", [0, -1, 2, 1.0, True, "1", None])
+def test_a_wrong_number_of_streams(converse, streams):
+    out = converse(said(FITTED), said({"streams": streams}), streamed=True, stay=30)
+    assert (out.status, out.reason) == ("error", GARBLED)
 
 
 def test_a_long_message_is_not_read(converse):

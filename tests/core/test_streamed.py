@@ -8,10 +8,11 @@ from helpers_plugins import install
 
 from oodd_eval import load_split
 from oodd_eval.data.parts import lengths_of, parts_of
+from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import UsageError
 from oodd_eval.plugins.contract import TOLERANCE, difference
 from oodd_eval.plugins.discovery import discover
-from oodd_eval.plugins.isolation import supervisor
+from oodd_eval.plugins.isolation import SCORES, supervisor
 from oodd_eval.plugins.isolation.child import Limits
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.scoring.executors import RunSettings
@@ -19,6 +20,8 @@ from oodd_eval.scoring.plan import make_plan
 from oodd_eval.scoring.runner import run
 
 PLUGIN = """
+import threading
+
 class Whole(Good):
     \"\"\"Has no ``update``, no state, and the length of what it was handed as its score.\"\"\"
     def fit(self, nominal):
@@ -49,10 +52,26 @@ class Raises(Rows):
         if super().update(observation, action) and self.n > 5: raise KeyError("row five")
         return 1.0
 
+class Locked(Rows):
+    \"\"\"Cannot be copied.\"\"\"
+    def fit(self, nominal): self.lock = threading.Lock()
+
+class Slow(Rows):
+    \"\"\"Takes long to copy.\"\"\"
+    copies = 0
+    def __deepcopy__(self, memo):
+        type(self).copies += 1
+        sum(range(3 * 10**6))
+        return Rows()
+    def update(self, observation, action=None):
+        assert type(self).copies < 2
+        return super().update(observation, action)
+
 @hookimpl
 def oodd_detectors():
-    both = DetectorSpec("rows", Rows, "a test's", inputs="observations+actions")
-    return [both, *offer(whole=Whole, no_float=NoFloat, late_nan=LateNan, raises=Raises)]
+    both = [DetectorSpec(name, cls, "a test's", inputs="observations+actions")
+            for name, cls in (("rows", Rows), ("locked", Locked), ("slow", Slow))]
+    return [*both, *offer(whole=Whole, no_float=NoFloat, late_nan=LateNan, raises=Raises)]
 """
 
 
@@ -83,14 +102,48 @@ OTHERS = [
     ("detector", "parameters"),
     [*QUICK, *(pytest.param(*other, marks=pytest.mark.slow) for other in OTHERS)],
 )
-def test_scores_row_by_row_are_those_of_batches(tiny_split, tmp_path, detector, parameters):
+def test_scores_in_lockstep_are_those_of_each_episode_alone_and_of_batches(
+    tiny_split, tmp_path, monkeypatch, detector, parameters
+):
     batch, expected, _ = run_rows(detector, tiny_split, tmp_path, streamed=False, **parameters)
     record, parts, _ = run_rows(detector, tiny_split, tmp_path, **parameters)
     assert record.ok, record.reason
     assert record.scores == f"{batch.scores}-rows"
+    monkeypatch.setattr(supervisor._UnitRun, "_stream", one_after_the_other)
+    _, alone, _ = run_rows(detector, tiny_split, tmp_path / "alone", **parameters)
     for part, sequences in parts.items():
-        for one, other in zip(sequences, expected[part], strict=True):
-            assert not difference(one, other, TOLERANCE)
+        for found, by_itself, whole in zip(sequences, alone[part], expected[part], strict=True):
+            assert found.tobytes() == by_itself.tobytes()
+            assert not difference(found, whole, TOLERANCE)
+
+
+STREAM = supervisor._UnitRun._stream
+
+
+def one_after_the_other(unit, *arguments):
+    unit.streams = 1
+    STREAM(unit, *arguments)
+
+
+class Spy:
+    """A channel that keeps what is sent, and answers every row with 0."""
+
+    def __init__(self):
+        self.sent = []
+        self.send_bytes = self.sent.append
+
+    def receive_bytes(self):
+        return SCORES + bytes(8 * (len(self.sent[-1]) // 16))
+
+
+def test_messages_until_an_end_say_nothing_of_it():
+    x = Trajectory(np.arange(60.0).reshape(20, 3))
+    spies = [Spy(), Spy()]
+    for spy, n in zip(spies, (12, 17), strict=True):
+        scores = supervisor._in_lockstep(spy, [x[:5], x[:n], x])
+        assert [*map(len, scores)] == [5, n, 20]
+    assert spies[0].sent[:12] == spies[1].sent[:12]
+    assert [len(message) // 16 for message in spies[0].sent] == [3] * 5 + [2] * 7 + [1] * 8 + [0]
 
 
 @pytest.fixture
@@ -98,8 +151,9 @@ def plugin(monkeypatch, tmp_path):
     install(monkeypatch, tmp_path / "plugin", "streamed", PLUGIN)
 
 
-def test_a_row_comes_with_the_action_before_it(plugin, tiny_split, tmp_path):
-    record, parts, sets = run_rows("rows", tiny_split, tmp_path / "out")
+@pytest.mark.parametrize("detector", ["rows", "locked", "slow"])
+def test_a_row_comes_with_the_action_before_it(plugin, tiny_split, tmp_path, detector):
+    record, parts, sets = run_rows(detector, tiny_split, tmp_path / "out")
     assert record.ok, record.reason
     for part, sequences in parts.items():
         for found, x in zip(sequences, sets[part], strict=True):

@@ -10,6 +10,7 @@ R rollouts of a time.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Self
 
 import numpy as np
 import torch
@@ -75,6 +76,10 @@ class Forecaster:
         self.width = 1 if alone else samples
         """Rollouts of every time, R."""
         self.kept = self._kept(longest) if horizon == 1 and self.table is not None else None
+
+    def __deepcopy__(self, memo: object) -> Self:
+        """Return itself, which copies of a detector share: nothing of it ever changes."""
+        return self
 
     @torch.no_grad()
     def errors(self, rows: Sequence[NDArray[np.float32]]) -> list[NDArray[np.float64]]:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from operator import add
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,10 @@ class Forest:
 
     trees: Sequence[Tree]
     window: int
+
+    def __deepcopy__(self, memo: object) -> Self:
+        """Return itself, which copies of a detector share: nothing of it ever changes."""
+        return self
 
     def predict(self, rows: NDArray[np.float32]) -> Floats:
         """Return the mean prediction of the trees, (B, D), for rows of shape (B, W * D)."""

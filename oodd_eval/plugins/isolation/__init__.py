@@ -3,7 +3,8 @@
 The harness makes every process and every socket. A process that scores gets one group of
 trajectories over a socket that no other process has, and ends with it. What goes over a socket is
 JSON and arrays, nothing executable: frames of `multiprocessing.connection`, each UTF-8 JSON, or an
-array as `numpy.save` writes it with pickling refused, or the numbers of one row or score.
+array as `numpy.save` writes it with pickling refused, or the numbers of rows or of
+their scores.
 """
 
 import ctypes
@@ -37,6 +38,9 @@ HEADER_BYTES: Final = 4096  # of an array, at most
 LOG_BYTES: Final = 64_000  # of what is printed, the last ones are kept
 CHUNK: Final = 64  # trajectories that a worker scores at once
 SCORED: Final = 93  # exit code of a process that has scored its group, and of no other
+
+SCORES: Final = b"="  # before the scores of rows, so that no JSON is taken for them
+COPY_SECONDS: Final = 0.01  # of a copy of a detector; what takes longer costs more than it saves
 
 MOST_PREFIXES: Final = 2000
 """Rows of the longest episode that is scored row by row without ``update``, by its prefixes."""

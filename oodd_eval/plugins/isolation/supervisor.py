@@ -11,6 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 import psutil
+from numpy.typing import NDArray
 
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.plugins.contract import PROGRESS_SECONDS, Progress, ignore_progress
@@ -21,6 +22,7 @@ from oodd_eval.plugins.isolation import (
     LOG_BYTES,
     MOST_PREFIXES,
     ROW_BYTES,
+    SCORES,
     Channel,
     ChannelClosedError,
     ChannelGarbledError,
@@ -79,8 +81,8 @@ def run_isolated(
 
     The request names ``plugin`` and ``detector``, its ``parameters``, ``seed``, ``horizon`` and
     perhaps ``baseline`` (see `make_detector`). `state` is that of an earlier fit, which replaces
-    fitting; with `keep`, the outcome has that of this one. `streamed` hands over one row at a time,
-    and waits for its score before the next; then nothing is explained. `progress` is called with
+    fitting; with `keep`, the outcome has that of this one. `streamed` hands over one row of
+    each episode at a time, and waits for the scores before the next; then nothing is explained. `progress` is called with
     the share of the fit that is done, as far as the detector tells, and with 1 at its end.
 
     Groups are read once and lazily. Scores come back in their order. When `stop` says True, the
@@ -114,6 +116,7 @@ class _UnitRun:
     peak: float = 0.0
     explains: bool = False
     updates: bool = False
+    streams: int = CHUNK
 
     def run(
         self, groups: Iterable[Iterable[Trajectory]], explained: Iterable[Iterable[Trajectory]]
@@ -220,26 +223,26 @@ class _UnitRun:
                 arrays.append(channel.receive_array(most))
 
     def _stream(self, channel: Channel, group: Iterable[Trajectory], order: str) -> None:
-        """Send a row, and wait for its score before the next one."""
-        for trajectory in group:
-            n, width, scores = len(trajectory), trajectory.action_dim, []
+        """Send episodes in lockstep: a row of each, and the next ones when all scores are there."""
+        rest, episodes = iter(group), list[Trajectory]()
+        while episodes := [*episodes, *islice(rest, max(0, self.streams - len(episodes)))]:
+            n, width = max(map(len, episodes)), episodes[0].action_dim
             if not self.updates and n > MOST_PREFIXES:
                 reason = f"an episode has {n} rows, and without update at most {MOST_PREFIXES} are "
                 raise GivenUpError("incompatible", reason + "scored row by row")
-            channel.send({order: width})
-            actions = np.pad(trajectory.actions, ((1, 0), (0, 0)))
-            rows = np.hstack([actions, trajectory.observations]).tobytes()
-            size, skipped = len(rows) // n, 4 * width  # Before the first row there is no action.
-            for start in range(0, len(rows), size):
-                channel.send_bytes(rows[start + skipped : start + size])
-                scores.append(score := channel.receive_bytes())
-                if len(score) != 8:
-                    _checked(message_of(score))
-                    raise ChannelGarbledError("a message in place of a score")
-                skipped = 0
-            channel.send_bytes(b"")
+            memory = self.limits.memory or psutil.virtual_memory().total
+            columns = 1 + width + episodes[0].observation_dim
+            shape = {"actions": width, "width": columns, "room": memory // 4}
+            most = min(len(episodes), self.streams)
+            channel.send({order: most, **shape})
+            streams = _value(_receive(channel), "streams", int)
+            if not 1 <= streams <= most:
+                raise ChannelGarbledError(f"{streams} streams for {most} episodes")
+            if streams < most:
+                self.streams = streams
+            self.outcome.scores += _in_lockstep(channel, episodes[:streams])
             self._cost(channel)
-            self.outcome.scores.append(np.frombuffer(b"".join(scores), "<f8").astype(np.float64))
+            episodes = episodes[streams:]
 
     def _cost(self, channel: Channel) -> None:
         """Receive what scoring has cost."""
@@ -247,6 +250,28 @@ class _UnitRun:
         memory = psutil.virtual_memory().total / 1e6
         self.seconds += _number(message, "seconds_score", time.monotonic() - self.start)
         self.peak = max(self.peak, _number(message, "peak_rss_mb", memory))
+
+
+def _in_lockstep(channel: Channel, episodes: Sequence[Trajectory]) -> list[NDArray[np.float64]]:
+    """Send rows of episodes until all have ended; return the scores."""
+    # Before an episode's first row there is no action.
+    rows = [
+        np.hstack([np.full((len(x), 1), i), np.pad(x.actions, ((1, 0), (0, 0))), x.observations])
+        for i, x in enumerate(episodes)
+    ]
+    rows = [x.astype(np.float32) for x in rows]
+    scores, t = [np.empty(len(x)) for x in rows], 0
+    while running := [i for i, x in enumerate(rows) if t < len(x)]:
+        channel.send_bytes(b"".join(rows[i][t].tobytes() for i in running))
+        frame = channel.receive_bytes()
+        if frame[:1] != SCORES or len(frame) != 1 + 8 * len(running):
+            _checked(message_of(frame))
+            raise ChannelGarbledError("a message in place of scores")
+        for i, score in zip(running, np.frombuffer(frame, "<f8", offset=1), strict=True):
+            scores[i][t] = score
+        t += 1
+    channel.send_bytes(b"")
+    return scores
 
 
 def _ended(child: Child, doing: str, *, gone: bool) -> GivenUpError:

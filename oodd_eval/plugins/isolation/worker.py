@@ -34,11 +34,12 @@ from numpy.typing import NDArray
 
 from oodd_eval.data.files import flush_streams
 from oodd_eval.data.trajectory import Trajectory, TrajectorySequence
-from oodd_eval.errors import ContractError, TrajectoryError
+from oodd_eval.errors import ContractError, TrajectoryError, UsageError
 from oodd_eval.plugins.contract import (
     Detector,
     StorableDetector,
     StreamingDetector,
+    copied,
     fit_detector,
     float_scores,
     make_detector,
@@ -48,10 +49,12 @@ from oodd_eval.plugins.discovery import describe, offer_of, printable
 from oodd_eval.plugins.explanations import explain_chunk, explains
 from oodd_eval.plugins.isolation import (
     CHILD_SUBREAPER,
+    COPY_SECONDS,
     FIT_END_SECONDS,
     MARK,
     ROW_BYTES,
     SCORED,
+    SCORES,
     Channel,
     ChannelClosedError,
     end_all,
@@ -240,19 +243,45 @@ def _score(channel: Channel, detector: Detector, *, score: int = 0, explain: int
         channel.send_array(array)
 
 
-def _score_rows(channel: Channel, detector: Detector, *, stream: int) -> None:
-    """Score an episode row by row: each comes when the score of the one before was sent."""
-    # A row is an observation, behind the action of that width that came before it, if there is one.
-    streaming = detector if isinstance(detector, StreamingDetector) else _Prefixes(detector, stream)
-    seconds, width = 0.0, 0
-    streaming.reset()
-    while row := channel.receive_bytes():
-        values, start = np.frombuffer(row, np.float32), time.perf_counter()
-        action = values[:width] if width else None
-        score = _real(streaming.update(values[width:], action))
-        seconds, width = seconds + time.perf_counter() - start, stream
-        channel.send_bytes(struct.pack("<d", score))
+def _score_rows(
+    channel: Channel, detector: Detector, *, stream: int, actions: int, width: int, room: int
+) -> None:
+    """Score episodes in lockstep: a row of each that runs comes when the last scores were sent.
+
+    There are `stream` episodes, or as many of them as there are streams for, which is told first.
+    """
+    streams = _streams(detector, actions, stream, room)
+    channel.send({"streams": len(streams)})
+    for streaming in streams:
+        streaming.reset()
+    seconds, begun = 0.0, False
+    while message := channel.receive_bytes():
+        # The episode's number, the action before the observation if there is one, the observation.
+        rows = np.frombuffer(message, np.float32).reshape(-1, width)
+        scores, start = [SCORES], time.perf_counter()
+        for row in rows:
+            action = row[1 : 1 + actions].copy() if begun and actions else None
+            score = streams[int(row[0])].update(row[1 + actions :].copy(), action)
+            scores.append(struct.pack("<d", _real(score)))
+        seconds, begun = seconds + time.perf_counter() - start, True
+        channel.send_bytes(b"".join(scores))
     channel.send({"seconds_score": seconds, "peak_rss_mb": peak_rss_mb()})
+
+
+def _streams(detector: Detector, actions: int, most: int, room: int) -> list[Any]:
+    """Return what scores up to so many episodes at a time: the detector, and copies if cheap."""
+    if not isinstance(detector, StreamingDetector):
+        # Each prefix is scored by itself: others beside it could change its last digits.
+        return [_Prefixes(detector, actions) for _ in range(most)]
+    streams, process = [detector], psutil.Process()
+    with suppress(UsageError):
+        while len(streams) < most and process.memory_info().rss < room:
+            start = time.process_time()
+            another = copied(detector)
+            if time.process_time() - start > COPY_SECONDS:
+                break
+            streams.append(another)
+    return streams
 
 
 def _real(score: object) -> float:
