@@ -142,7 +142,11 @@ class Detector(Protocol):
 
 @runtime_checkable
 class StreamingDetector(Detector, Protocol):
-    """A detector that can run beside a robot, one observation at a time."""
+    """A detector that can run beside a robot, one observation at a time.
+
+    Several episodes may run at a time, each in a deep copy of the fitted detector: keep what an
+    episode leaves behind in attributes, not in a module, a class or a closure.
+    """
 
     def reset(self) -> None:
         """Begin a new episode; `fit` does so too."""

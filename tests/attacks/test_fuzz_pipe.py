@@ -41,7 +41,8 @@ FIT = st.fixed_dictionaries(
 )  # fmt: skip
 STATE = st.fixed_dictionaries({"names": st.lists(st.text()) | ANY, "text": st.text() | ANY})
 NAMES = st.sampled_from(["status", "reason", "seconds_score", "peak_rss_mb", "seconds_fit",
-                         "warm_up", "explains", "updates", "forks", "state", "streams"])  # fmt: skip
+                         "warm_up", "explains", "updates", "forks", "state",
+                         "streams"])  # fmt: skip
 KNOWN = st.sampled_from(["error", "ok", "oom", "timeout", 0, 1.5, True])
 MESSAGE = FIT | STATE | st.dictionaries(NAMES, KNOWN | ANY, max_size=4) | ANY
 JSON = MESSAGE.map(lambda message: json.dumps(message).encode())

@@ -1,6 +1,7 @@
 """Runs that hand over one row at a time: the same scores, and nothing of what comes later."""
 
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.scoring.executors import RunSettings
 from oodd_eval.scoring.plan import make_plan
 from oodd_eval.scoring.runner import run
+from oodd_eval.scoring.unit import mixed
 
 PLUGIN = """
 import threading
@@ -92,8 +94,9 @@ def run_rows(detector, split, output=None, *, streamed=True, **parameters):
 QUICK = [(name, {}) for name in ("mewma", "persistence", "clock", "random")]
 OTHERS = [
     *((name, {}) for name in ("mahalanobis", "range", "comb", "pca", "knn", "deedee")),
-    ("rf", {"trees": 3}),
-    *((name, {"updates": 3}) for name in ("pe", "pe-a", "npn", "riqn", "rnd", "paano")),
+    *((name, {}) for name in ("manifold", "panel", "oracle-gym")),
+    *((name, {"trees": 3}) for name in ("rf", "rf-ewma")),
+    *((name, {"updates": 3}) for name in ("pe", "pe-a", "npn", "riqn", "riqn-ms", "rnd", "paano")),
     *((name, {"updates": 3}) for name in ("rpt-a", "logpzo", "logpzo-a", "wm-kl-a")),
 ]
 
@@ -169,6 +172,18 @@ def test_without_update_a_row_is_the_last_of_a_prefix(plugin, tiny_split, tmp_pa
     for part, sequences in parts.items():
         for found, x in zip(sequences, sets[part], strict=True):
             assert found.tolist() == [scale + n + 1.0 for n in range(len(x))]
+
+
+@pytest.mark.parametrize("tests", [{"nominal": 4, "iid": 4, "drift": 4}, {"nominal": 3, "iid": 5}])
+def test_a_group_has_episodes_of_all_parts_and_no_two_of_one_seed(tests):
+    sizes = {"calibration": 7, **{f"test/{part}": n for part, n in tests.items()}}
+    drawn = mixed(sizes)
+    assert len(drawn) == len(tests)
+    assert sorted(chain(*drawn)) == [(p, i) for p, n in sorted(sizes.items()) for i in range(n)]
+    for group in drawn:
+        seeds = [i for part, i in group if part != "calibration"]
+        assert len(seeds) == len({*seeds}) > 0
+        assert "calibration" in {part for part, _ in group}
 
 
 def test_without_update_long_episodes_are_incompatible(plugin, tiny_split, monkeypatch):

@@ -82,8 +82,9 @@ def run_isolated(
     The request names ``plugin`` and ``detector``, its ``parameters``, ``seed``, ``horizon`` and
     perhaps ``baseline`` (see `make_detector`). `state` is that of an earlier fit, which replaces
     fitting; with `keep`, the outcome has that of this one. `streamed` hands over one row of
-    each episode at a time, and waits for the scores before the next; then nothing is explained. `progress` is called with
-    the share of the fit that is done, as far as the detector tells, and with 1 at its end.
+    each episode at a time, and waits for the scores before the next; then nothing is explained.
+    `progress` is called with the share of the fit that is done, as far as the detector tells, and
+    with 1 at its end.
 
     Groups are read once and lazily. Scores come back in their order. When `stop` says True, the
     worker is killed and the status is ``"error"``. Only errors of reading the trajectories are
