@@ -1,10 +1,10 @@
 """Cost of groups apart: a plain run beside one with larger groups, and a sandboxed one by rows.
 
-``python benchmarks/bench_isolation.py [--rows] [DETECTOR ...]`` (default rf, npn and riqn, and two more by rows) first
-fits and scores hopper of split mini, in turns, as a run does and with each part as one group: more
-forks and smaller batches come on top of the work itself. Then it streams 16 episodes into fresh
-sandboxes, one after the other and in lockstep, and says what a season takes by that, without fits,
-in seconds of the processor.
+``python benchmarks/bench_isolation.py [--rows] [DETECTOR ...]`` (default rf, npn and riqn, by rows
+mewma, pe, panel, rf and riqn) first fits and scores hopper of split mini, in turns, as a run does
+and with each part as one group: more forks and smaller batches come on top of the work itself. Then
+it streams 16 episodes into fresh sandboxes, one after the other and in lockstep, and says what a
+season takes by that in processor hours, without fits.
 Exit code 1 when the plain runs cost more than 10 % of all together, or lockstep costs more than
 one after the other.
 """
