@@ -256,11 +256,10 @@ class _UnitRun:
 def _in_lockstep(channel: Channel, episodes: Sequence[Trajectory]) -> list[NDArray[np.float64]]:
     """Send rows of episodes until all have ended; return the scores."""
     # Before an episode's first row there is no action.
-    rows = [
-        np.hstack([np.full((len(x), 1), i), np.pad(x.actions, ((1, 0), (0, 0))), x.observations])
-        for i, x in enumerate(episodes)
-    ]
-    rows = [x.astype(np.float32) for x in rows]
+    rows = []
+    for i, x in enumerate(episodes):
+        parts = [np.full((len(x), 1), i), np.pad(x.actions, ((1, 0), (0, 0))), x.observations]
+        rows.append(np.hstack(parts, dtype=np.float32, casting="unsafe"))
     scores, t = [np.empty(len(x)) for x in rows], 0
     while running := [i for i, x in enumerate(rows) if t < len(x)]:
         channel.send_bytes(b"".join(rows[i][t].tobytes() for i in running))
