@@ -9,11 +9,14 @@ from __future__ import annotations
 
 import inspect
 import os
-from collections.abc import Callable, Collection, Iterator
+import sys
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib.machinery import PathFinder
 from importlib.metadata import EntryPoint
 from importlib.util import find_spec
+from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, TypeVar
 
@@ -68,7 +71,8 @@ def _working_directory() -> str:
 class Offer:
     """A detector (`spec`) together with the plug-in that offers it.
 
-    `plugin` names the entry point, `module` what it leads to; pip installed the `distribution`.
+    `plugin` names the entry point, `module` what it leads to; pip installed the `distribution`:
+    into directories of `packages`, which only sandboxes have on their import path, or here.
     """
 
     spec: DetectorSpec
@@ -76,6 +80,7 @@ class Offer:
     module: str
     distribution: str
     version: str
+    packages: tuple[Path, ...] = ()
 
     @property
     def origin(self) -> str:
@@ -84,7 +89,7 @@ class Offer:
 
     def unavailable(self) -> str:
         """Return why the detector cannot run here, with the command that helps; empty if it can."""
-        missing = [name for name in self.spec.requires if not _importable(name)]
+        missing = [name for name in self.spec.requires if not self._importable(name)]
         if not missing:
             return ""
         requirements = f'"{self.spec.extra}"' if self.spec.extra else " ".join(missing)
@@ -94,6 +99,15 @@ class Offer:
         """Raise `MissingExtraError` when it cannot run here."""
         if reason := self.unavailable():
             raise MissingExtraError(f"detector {self.spec.name!r} {reason}")
+
+    def _importable(self, name: str) -> bool:
+        """Tell whether a module could be imported, by the package that it is in: nothing is."""
+        top = name.partition(".")[0]
+        try:
+            found = find_spec(top) or PathFinder.find_spec(top, [*map(str, self.packages)])
+        except (ImportError, ValueError, AttributeError):
+            return False
+        return found is not None
 
 
 class Broken(NamedTuple):
@@ -196,13 +210,14 @@ class Plugins:
         points: list[EntryPoint],
         observer_points: list[EntryPoint],
         load: Callable[[EntryPoint], Offering] | None = None,
+        packages: Sequence[Path] = (),
     ) -> None:
         self.loaded: dict[str, Offering] = {}
         self.broken: list[Broken] = []
         self.notes: list[str] = []
         self.points, self.observer_points = points, observer_points
         self._load_point, self._waiting = load or _loaded, list(points)
-        self._observed = load is None
+        self._observed, self._packages = load is None, tuple(packages)
         self._offers: dict[str, Offer] = {}
         self._forms: dict[str, str] = {}
         self._listener: Callable[[Broken], object] | None = None
@@ -336,7 +351,7 @@ class Plugins:
                     by = f"{by} and by {name_of(point)}"
                     advice = f"uninstall one of them, or leave it out with -p no:{point.name}"
                     raise PluginError(f"detector {spec.name!r} is offered twice, by {by}: {advice}")
-                offers[spec.name] = _offer(point, spec)
+                offers[spec.name] = self._offer(point, spec)
             self._forms[point.name] = plugin.form
             self._offers |= offers
             self.loaded[point.name] = plugin
@@ -364,7 +379,7 @@ class Plugins:
                 reason = f"failed to make detector {text!r}: {printable(describe(error))}"
                 raise PluginError(f"{name_of(maker.point)} {reason}") from error
             if spec and ":" in spec.name:
-                return _offer(maker.point, spec)
+                return self._offer(maker.point, spec)
             if spec:
                 expected = "None or a DetectorSpec whose name has a colon"
                 reason = f"made {spec.name!r} of {text!r}, expected {expected}"
@@ -374,24 +389,32 @@ class Plugins:
         advice = "oodd-eval list detectors says which names there are"
         raise UsageError(f"no plug-in makes a detector of {text!r}: {whom} ({advice})")
 
+    def _offer(self, point: EntryPoint, spec: DetectorSpec) -> Offer:
+        """Return a spec as an offer; its version names the library that does the work, too."""
+        version = "+".join(filter(None, (named(point.dist)[1], spec.version)))
+        distribution = distribution_of(point)
+        return Offer(spec, point.name, point.module, distribution, version, self._packages)
+
 
 def discover(
     disabled: Collection[str] = (),
     *,
     only: Collection[str] | None = None,
     load: Callable[[EntryPoint], Offering] | None = None,
+    packages: Sequence[Path] = (),
 ) -> Plugins:
     """Find the installed plug-ins, without loading any; those `disabled` are left out.
 
     `only` names those to take, beside the built-in rows. None means all, or those that the
     environment variable ``OODD_EVAL_PLUGINS`` names. `load` is used in place of importing them.
+    With directories of `packages`, plug-ins are those installed there, and no others.
     """
-    every, broken = points_of((hooks.PROJECT, "oodd_eval.observers"))
+    every, broken = points_of((hooks.PROJECT, "oodd_eval.observers"), packages)
     points, observers = (
         sorted(group, key=lambda p: (_foreign(p), distribution_of(p), p.name)) for group in every
     )
     names = {point.name for point in (*points, *observers)}
-    if only is None and RESTRICT in os.environ:
+    if only is None and not packages and RESTRICT in os.environ:
         only = [name.strip() for name in os.environ[RESTRICT].split(",") if name.strip()]
     check_known("plug-in", names, *disabled, *(only or ()))
 
@@ -399,7 +422,7 @@ def discover(
         built_in = point.name == _BUILT_IN and not _foreign(point)
         return point.name not in disabled and (only is None or built_in or point.name in only)
 
-    plugins = Plugins([*filter(selected, points)], [*filter(selected, observers)], load)
+    plugins = Plugins([*filter(selected, points)], [*filter(selected, observers)], load, packages)
     plugins.broken += [Broken("unknown", b.distribution, b.reason) for b in broken if b.is_ours]
     if not_ours := [b for b in broken if not b.is_ours]:
         more = f", and {len(not_ours) - 1} more" if not_ours[1:] else ""
@@ -411,16 +434,13 @@ def _loaded(point: EntryPoint) -> Plugin:
     return Plugin(point, register(point.load()))
 
 
-def plugin_of(distribution: str, name: str) -> Plugin:
+def plugin_of(distribution: str, name: str, packages: Sequence[Path] = ()) -> Plugin:
     """Return a loaded plug-in, whatever it raises when it is."""
-    (points,), _ = points_of((hooks.PROJECT,))
-    return _loaded(next(p for p in points if p.name == name and distribution_of(p) == distribution))
-
-
-def _offer(point: EntryPoint, spec: DetectorSpec) -> Offer:
-    """Return a spec as an offer; its version names the library that does the work, too."""
-    version = "+".join(filter(None, (named(point.dist)[1], spec.version)))
-    return Offer(spec, point.name, point.module, distribution_of(point), version)
+    (points,), _ = points_of((hooks.PROJECT,), packages)
+    for point in points:
+        if (point.name, distribution_of(point)) == (name, distribution):
+            return _loaded(point)
+    raise PluginError(f"{distribution} is not installed in the environment of {sys.executable}")
 
 
 def name_of(point: EntryPoint) -> str:
@@ -442,9 +462,9 @@ def register(plugin: object, *specifications: ModuleType) -> pluggy.HookRelay:
     return manager.hook
 
 
-def offer_of(plugin: str, detector: str) -> Offer:
+def offer_of(plugin: str, detector: str, packages: Sequence[Path] = ()) -> Offer:
     """Return a detector of a plug-in; raise `PluginError` when the plug-in cannot be loaded."""
-    plugins = discover(only=[plugin])
+    plugins = discover(only=[plugin], packages=packages)
     try:
         return plugins.offer(detector)
     except UnknownNameError:
@@ -496,10 +516,3 @@ def distribution_of(point: EntryPoint) -> str:
     """Return the name of the distribution that pip installed."""
     return named(point.dist)[0]
 
-
-def _importable(name: str) -> bool:
-    """Tell whether a module could be imported, by the package that it is in: nothing is."""
-    try:
-        return find_spec(name.partition(".")[0]) is not None
-    except (ImportError, ValueError, AttributeError):
-        return False

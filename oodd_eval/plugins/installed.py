@@ -1,10 +1,13 @@
 """Entry points of installed distributions, any of which may have broken metadata."""
 
 import functools
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Sequence
 from importlib.metadata import Distribution, EntryPoint, EntryPoints, distributions, entry_points
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, Final, NamedTuple
+
+LONGEST_NAME: Final = 200  # of distributions, versions and plug-ins
 
 
 class BrokenMetadata(NamedTuple):
@@ -18,13 +21,21 @@ class BrokenMetadata(NamedTuple):
     is_ours: bool
 
 
-def points_of(groups: Sequence[str]) -> tuple[list[list[EntryPoint]], list[BrokenMetadata]]:
-    """Return the entry points of some groups, and distributions that are left out as broken."""
+def points_of(
+    groups: Sequence[str], packages: Sequence[Path] = ()
+) -> tuple[list[list[EntryPoint]], list[BrokenMetadata]]:
+    """Return the entry points of some groups, and distributions that are left out as broken.
+
+    They are those of some directories of `packages`, or of the environment.
+    """
     broken: list[BrokenMetadata] = []
     try:
-        every = [entry_points(group=group) for group in groups]
+        every = [] if packages else [entry_points(group=group) for group in groups]
     except Exception:  # noqa: BLE001  one is broken; which one is found by looking at each
-        points = EntryPoints(_each(broken))
+        every = []
+    if not every:
+        path: dict[str, Any] = {"path": [*map(str, packages)]} if packages else {}
+        points = EntryPoints(_each(distributions(**path), broken))
         every = [points.select(group=group) for group in groups]
     return [[p for p in points if _is_sound(p, broken)] for points in every], broken
 
@@ -32,19 +43,20 @@ def points_of(groups: Sequence[str]) -> tuple[list[list[EntryPoint]], list[Broke
 def _is_sound(point: EntryPoint, broken: list[BrokenMetadata]) -> bool:
     try:
         named(point.dist)
-        return bool(point.name.isprintable() and point.name and point.module.isprintable())
+        short = 0 < len(point.name) <= LONGEST_NAME
+        return short and point.name.isprintable() and point.module.isprintable()
     except Exception as error:  # noqa: BLE001
         broken.append(_broken(point.dist, error))
         return False
 
 
-def _each(broken: list[BrokenMetadata]) -> list[EntryPoint]:
+def _each(found: Iterable[Distribution], broken: list[BrokenMetadata]) -> list[EntryPoint]:
     """Return the entry points of every sound distribution, and add the others to a list."""
     # Of two with one name the first on the path counts, as it is the one that is imported.
     points: dict[str, list[EntryPoint]] = {}
-    for distribution in distributions():
+    for distribution in found:
         try:
-            name = named(distribution)[0].lower().replace("_", "-").replace(".", "-")
+            name = normalized(named(distribution)[0])
             points.setdefault(name, [*distribution.entry_points])
         except Exception as error:  # noqa: BLE001
             broken.append(_broken(distribution, error))
@@ -58,9 +70,14 @@ def named(distribution: Distribution | None) -> tuple[str, str]:
         return "unknown distribution", ""
     texts = distribution.metadata["Name"], distribution.metadata["Version"]
     for kind, text in zip(("name", "version"), texts, strict=True):
-        if not isinstance(text, str) or not text.isprintable() or not 0 < len(text) <= 200:
+        if not isinstance(text, str) or not text.isprintable() or not 0 < len(text) <= LONGEST_NAME:
             raise ValueError(f"its {kind} is {text!r:.100}, expected a short line")
     return texts
+
+
+def normalized(name: str) -> str:
+    """Return the name of a distribution as indexes compare it."""
+    return re.sub(r"[-_.]+", "-", name).lower()
 
 
 def _broken(distribution: Distribution | None, error: Exception) -> BrokenMetadata:

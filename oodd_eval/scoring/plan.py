@@ -241,7 +241,7 @@ def make_unit(
     kinds = {name: declared[name].decides if name in declared else "fit" for name in resolved}
     recorded = {name: value for name, value in resolved.items() if kinds[name] != "nothing"}
     overrides = {n: v for n, v in recorded.items() if n not in declared or v != declared[n].default}
-    source = source_digest(offer.module) if offer.plugin else ""
+    source = source_digest(offer.module, offer.packages) if offer.plugin else ""
     identity: dict[str, Any] = {
         "distribution": offer.distribution,
         "version": offer.version,
@@ -297,27 +297,35 @@ _HARNESS: Final = ("oodd_eval", "oodd_checks", "oodd_leaderboard", "oodd_live", 
 
 
 @functools.cache
-def source_digest(module: str) -> str:
+def source_digest(module: str, packages: tuple[Path, ...] = ()) -> str:
     """Return the SHA-256 of a plug-in's own packages and of the contract's version.
 
     These are the package that the entry point names and all packages ``oodd_*`` that it imports.
     The harness is covered by `CONTRACT`, third-party libraries by the versions in a record's
-    provenance.
+    provenance. Of a plug-in in directories of packages all that lies there counts, but the
+    metadata. Nothing is imported.
     """
     content = hashlib.sha256(f"contract {CONTRACT}\0".encode())
-    pending, seen = [module], {*_HARNESS}
-    files: dict[str, bytes] = {}
+    digests: dict[str, str] = {}
+    for directory in packages:
+        for path in directory.rglob("*"):
+            name = path.relative_to(directory)
+            if path.is_file() and not name.parts[0].endswith(".dist-info"):
+                with path.open("rb") as file:
+                    digests[str(name)] = hashlib.file_digest(file, "sha256").hexdigest()
+    pending, seen = [] if packages else [module], {*_HARNESS}
     while pending:
         top = pending.pop().partition(".")[0]
         if top in seen:
             continue
         seen.add(top)
         for name, path in _files(top):
-            files[name] = path.read_bytes()
+            code = path.read_bytes()
+            digests[name] = hashlib.sha256(code).hexdigest()
             if path.suffix == ".py":
-                pending += [package.decode() for package in _IMPORT.findall(files[name])]
-    for name, code in sorted(files.items()):
-        content.update(f"{name}\0{hashlib.sha256(code).hexdigest()}\0".encode())
+                pending += [package.decode() for package in _IMPORT.findall(code)]
+    for name, digest in sorted(digests.items()):
+        content.update(f"{name}\0{digest}\0".encode())
     return content.hexdigest()
 
 

@@ -158,7 +158,7 @@ def _result(message: dict[str, Any], name: str) -> Result:
 
 
 if __name__ == "__main__":
-    channel = connect(sys.argv[1:])
+    channel, _ = connect(sys.argv[1:])
     try:
         os.chdir(Path.cwd())
     except OSError:  # it is gone or cannot be gone back to, and pytest needs one

@@ -12,9 +12,11 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 from oodd_eval.errors import PluginError, UsageError
+from oodd_eval.plugins import PROJECT
 from oodd_eval.plugins.contract import Detector, DetectorSpec
 from oodd_eval.plugins.discovery import (
     Plugin,
@@ -31,6 +33,7 @@ from oodd_eval.plugins.isolation.child import Child, GivenUpError, Launcher, Lim
 from oodd_eval.plugins.isolation.worker import connect
 from oodd_eval.plugins.specs import MOST_SPECS, is_line
 from oodd_leaderboard.sandbox.described_specs import description_of, spec_of
+from oodd_leaderboard.sandbox.metadata import check_packages
 
 if TYPE_CHECKING:
     from oodd_eval.data.registry import Spec
@@ -51,7 +54,20 @@ def discover_in_sandbox(
     They neither observe runs nor offer environments, anomalies and readers. `memory` limits the
     bytes of a process that loads them.
     """
-    return _Describer(disabled, launcher, memory).plugins
+    return _Describer(launcher, memory, disabled=disabled).plugins
+
+
+def discover_entry(packages: Path, launcher: Launcher, memory: int | None) -> Plugins:
+    """Find the plug-ins in a directory of a stranger's packages, and no others.
+
+    `launcher` is a sandbox with these packages; here metadata alone is read of them. Raises
+    `PluginError` as `check_packages` does, and where they offer nothing.
+    """
+    check_packages(packages)
+    plugins = _Describer(launcher, memory, packages=[packages]).plugins
+    if not plugins.points:
+        raise PluginError(f"it offers no plug-in: expected an entry point of group {PROJECT}")
+    return plugins
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,8 +104,15 @@ class DescribedPlugin:
 class _Describer:
     """Has a sandbox load the plug-ins of a distribution, all at once, when one is needed."""
 
-    def __init__(self, disabled: Collection[str], launcher: Launcher, memory: int | None) -> None:
-        self.plugins = discover(disabled, load=self._load)
+    def __init__(
+        self,
+        launcher: Launcher,
+        memory: int | None,
+        *,
+        disabled: Collection[str] = (),
+        packages: Sequence[Path] = (),
+    ) -> None:
+        self.plugins = discover(disabled, load=self._load, packages=packages)
         self._launcher, self._limits = launcher, Limits(SECONDS, memory)
         self._answers: dict[tuple[str, str], Answer] = {}
 
@@ -169,12 +192,12 @@ def _answer(plugin: Plugin, text: str) -> Answer:
 
 def main(arguments: Sequence[str]) -> NoReturn:
     """Load the plug-ins of a distribution, tell what they offer, and end."""
-    channel = connect(arguments)
+    channel, packages = connect(arguments)
     request, answers = channel.receive(), {}
     for name in request["plugins"]:
         try:
             with staying():
-                plugin = plugin_of(request["distribution"], name)
+                plugin = plugin_of(request["distribution"], name, packages)
                 answers[name] = _answer(plugin, request["make"])
         except BaseException as error:  # noqa: BLE001  foreign code may raise anything
             answers[name] = {"broken": printable(describe(error))}

@@ -1,7 +1,7 @@
 """A launcher of workers, each in a sandbox of its own, which bubblewrap makes.
 
-The worker sees the system's programs and libraries, the interpreter and what can be imported, all
-read-only. Its home is ``/tmp``: memory of limited size, which is gone when the worker ends. It has
+The worker sees the system's programs and libraries, the interpreter, what can be imported, and the
+packages that only sandboxes get, all read-only. Its home is ``/tmp``: memory of limited size, which is gone when the worker ends. It has
 no network, sees no process but its own, has no rights, and is nobody. No directory of the system
 is its to write, and none outlives it.
 """
@@ -13,7 +13,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
@@ -26,6 +26,7 @@ SCRATCH: Final = "/tmp"  # noqa: S108  of the sandbox, not of the system
 SCRATCH_BYTES: Final = 2 * 10**9  # of /tmp, beside --memory: the training episodes lie there
 SHARED_BYTES: Final = 256 * 10**6  # of /dev/shm
 NOBODY: Final = "65534"
+PACKAGES: Final = Path("/packages")  # Numbers below it: paths of this machine may tell something.
 
 _READ_ONLY: Final = (
     "/usr",
@@ -67,13 +68,17 @@ _SUFFIXES: Final = (
 class Sandbox:
     """Launcher of workers, each of which has a sandbox of its own.
 
-    `hidden` are paths that they must not see, wherever they lie.
+    `hidden` are paths that they must not see, wherever they lie, and `packages` directories of
+    packages that no other process imports.
     """
 
     processes = 256
 
-    def __init__(self, hidden: Iterable[str | Path]) -> None:
+    def __init__(self, hidden: Iterable[str | Path], packages: Iterable[str | Path] = ()) -> None:
         self._hidden = [Path(os.path.realpath(path)) for path in hidden]
+        targets = (Path(os.path.realpath(path)) for path in packages)
+        self._packages = {PACKAGES / str(i): target for i, target in enumerate(targets)}
+        self.packages = [*map(str, self._packages)]
         self._mounts: dict[tuple[Path, ...], tuple[list[str], bool]] = {}
 
     def wrap(self, command: Sequence[str]) -> tuple[list[str], list[int]]:
@@ -81,8 +86,9 @@ class Sandbox:
         # Directories of results are made after the first sandboxes.
         existing = tuple(path for path in self._hidden if path.exists())
         if existing not in self._mounts:
-            readable = tuple(dict.fromkeys(_readable()))
-            self._mounts[existing] = [*_mounts(readable, existing)], _may_be_nobody(readable)
+            readable = {path: path for path in _readable()} | self._packages
+            nobody = _may_be_nobody(tuple(readable.items()))
+            self._mounts[existing] = [*_mounts(readable, existing)], nobody
         mounts, nobody = self._mounts[existing]
         return _bubblewrap(mounts, command, nobody=nobody)
 
@@ -92,18 +98,20 @@ class Sandbox:
         return kept | dict.fromkeys(("HOME", "TMPDIR", "XDG_CACHE_HOME"), SCRATCH)
 
 
-def make_sandbox(hidden: Iterable[str | Path] = ()) -> Sandbox:
+def make_sandbox(
+    hidden: Iterable[str | Path] = (), packages: Iterable[str | Path] = ()
+) -> Sandbox:
     """Return a launcher, once a process has run in a sandbox.
 
     Raises `UsageError` if bubblewrap is not installed, or may not make a sandbox here.
     """
-    sandbox = Sandbox(hidden)
-    command, descriptors = sandbox.wrap([sys.executable, "-I", "-c", ""])
+    sandbox = Sandbox(hidden, packages)
+    command, descriptors = sandbox.wrap([sys.executable, "-I", "-c", "import oodd_eval"])
     code, error = _run(command, descriptors, sandbox.environment())
     if code:
         raise UsageError(
             f"--sandbox: bubblewrap cannot make a sandbox here: {error.strip()[-300:]}; "
-            "user namespaces have to be allowed"
+            "user namespaces have to be allowed, and oodd-eval has to be installed"
         )
     return sandbox
 
@@ -128,14 +136,14 @@ def _run(
 
 
 @functools.cache
-def _may_be_nobody(readable: tuple[Path, ...]) -> bool:
+def _may_be_nobody(readable: tuple[tuple[Path, Path], ...]) -> bool:
     """Tell whether the superuser's workers can be nobody, who has to be able to read the files."""
     # Otherwise, as for other users, a worker has the user's number outside, and nobody's inside.
     if os.geteuid() != 0 or not shutil.which("setpriv"):
         return False
     looks = ["/bin/sh", "-c", 'for path; do [ -r "$path" ] || exit 1; done', "sh"]
-    looks += [str(path) for path in readable if not path.is_symlink()]
-    return _run(*_bubblewrap([*_mounts(readable, [])], looks, nobody=True), {})[0] == 0
+    looks += [str(path) for path, _ in readable if not path.is_symlink()]
+    return _run(*_bubblewrap([*_mounts(dict(readable), [])], looks, nobody=True), {})[0] == 0
 
 
 def _bubblewrap(
@@ -184,8 +192,8 @@ def _frozen() -> dict[str, bytes]:
     return frozen
 
 
-def _mounts(readable: Iterable[Path], hidden: Sequence[Path]) -> Iterator[str]:
-    """Yield the arguments that mount what a worker sees."""
+def _mounts(readable: Mapping[Path, Path], hidden: Sequence[Path]) -> Iterator[str]:
+    """Yield the arguments that mount what a worker sees, as some paths here by those there."""
     yield from ("--proc", "/proc", "--dev", "/dev", "--chdir", SCRATCH)
     for writable, size in ((SCRATCH, SCRATCH_BYTES), ("/dev/shm", SHARED_BYTES)):  # noqa: S108
         yield from ("--perms", "1777", "--size", str(size), "--tmpfs", writable)
@@ -196,14 +204,14 @@ def _mounts(readable: Iterable[Path], hidden: Sequence[Path]) -> Iterator[str]:
     for directory in dict.fromkeys(d for path in readable for d in reversed(path.parents)):
         yield from ("--perms", "0755", "--dir", str(directory))
     targets: dict[Path, Path] = {}  # real paths by those in the sandbox
-    for path in readable:
+    for path, source in readable.items():
         if any(path.is_relative_to(other) for other in targets):
             continue
         if path.is_symlink() and path.parent == Path("/"):  # such as /lib
             yield from ("--symlink", str(path.readlink()), str(path))
             continue
-        targets[path] = Path(os.path.realpath(path))
-        yield from ("--ro-bind", str(path), str(path))
+        targets[path] = Path(os.path.realpath(source))
+        yield from ("--ro-bind", str(source), str(path))
     for secret in hidden:
         for path, target in targets.items():
             if secret.is_relative_to(target):
@@ -231,7 +239,7 @@ def _readable() -> Iterator[Path]:
         yield Path(prefix)
     yield Path(os.path.realpath(sys.executable)).parent
     # A checkout on the import path also holds results and splits: only its modules are shown.
-    for entry in map(Path, dict.fromkeys(sys.path)):
+    for entry in map(Path, _import_path()):
         if entry.is_file() or entry.name in {"site-packages", "dist-packages"}:
             yield entry.absolute()
         elif entry.is_dir():
@@ -244,6 +252,13 @@ def _readable() -> Iterator[Path]:
                 for path in (*(spec.submodule_search_locations or ()), spec.origin):
                     if path and Path(path).exists():
                         yield Path(path).absolute()
+
+
+@functools.cache
+def _import_path() -> list[str]:
+    """Return the import path of the environment, which is a worker's: without that of variables."""
+    ask = [sys.executable, "-I", "-c", r"import sys; print(*sys.path, sep='\0', end='')"]
+    return subprocess.run(ask, capture_output=True, text=True, check=True).stdout.split("\0")  # noqa: S603  our own interpreter
 
 
 def _top(point: EntryPoint) -> str:

@@ -66,6 +66,10 @@ class Launcher(Protocol):
     def processes(self) -> int:
         """Number of processes that a worker and all that it has started may be at a time."""
 
+    @property
+    def packages(self) -> Sequence[str]:
+        """Directories of packages there, which a worker appends to its import path."""
+
     def wrap(self, command: Sequence[str]) -> tuple[list[str], list[int]]:
         """Return the command that runs another one there, and descriptors that it reads."""
 
@@ -87,9 +91,11 @@ class GivenUpError(OoddError, RuntimeError):
 class Child:
     """A module run as ``python -m MODULE CHANNEL_FD [LIFELINE_FD]``, within limits.
 
-    It has no standard input, the import path of this process, one thread for numerical libraries,
-    and none of the variables that steer the harness. Without a launcher it has a lifeline, which
-    the system closes when this process is killed: see `oodd_eval.plugins.isolation.worker.connect`.
+    It has no standard input, one thread for numerical libraries, and none of the variables that
+    steer the harness. Without a launcher it has the import path of this process and a lifeline,
+    which the system closes when this process is killed: see
+    `oodd_eval.plugins.isolation.worker.connect`. With one it has the import path of the
+    environment, and what the launcher names for it.
     A thread keeps the limits; the limit of memory is for the process with all that it has started,
     and seconds count from `start`, which may be set.
     After a limit was passed, or the process has ended, what was sent can still be read, and its
@@ -115,7 +121,10 @@ class Child:
         command = [sys.executable, "-P", "-m", module, *map(str, passed)]
         environment = {**_environment(launcher), MARK: self._mark}
         if launcher:
-            command, arguments = launcher.wrap(command)
+            # Isolated as by -I, which would also drop the seed of hashes: the import path has no
+            # directory of the user's and none of a variable, nor the working directory.
+            command[1:1] = ["-s"]
+            command, arguments = launcher.wrap([*command, *launcher.packages])
             passed += arguments
         self._process = subprocess.Popen(  # noqa: S603  our own interpreter and module
             command,
@@ -272,10 +281,10 @@ def _killed_for_memory() -> int:
 
 
 def _environment(launcher: Launcher | None) -> dict[str, str]:
-    path = os.pathsep.join(str(Path(entry).absolute()) for entry in sys.path)
     # A detector must not see the harness's settings, nor the test that pytest names.
     steering = ("OODD_EVAL_", "PYTEST_CURRENT_TEST")
     variables = {n: value for n, value in os.environ.items() if not n.startswith(steering)}
-    kept = launcher.environment() if launcher else variables
+    path = os.pathsep.join(str(Path(entry).absolute()) for entry in sys.path)
+    kept = launcher.environment() if launcher else {**variables, "PYTHONPATH": path}
     single = dict.fromkeys(_SINGLE_THREAD, "1")
-    return {**kept, **single, **_QUIET_ALLOCATOR, "PYTHONPATH": path, "PYTHONHASHSEED": "0"}
+    return {**kept, **single, **_QUIET_ALLOCATOR, "PYTHONHASHSEED": "0"}

@@ -125,11 +125,11 @@ def peak_rss_mb() -> float:
         return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6
 
 
-def serve(channel: Channel) -> None:
+def serve(channel: Channel, packages: Sequence[Path] = ()) -> None:
     """Make the requested detector, have it fitted, tell of it, and do what is ordered."""
     threads, pid = psutil.Process().num_threads(), os.getpid()
     request = channel.receive()
-    detector = _detector(request)
+    detector = _detector(request, packages)
     start = time.perf_counter()
     if request["restore"]:
         if not isinstance(detector, StorableDetector):
@@ -179,9 +179,9 @@ def _obey(channel: Channel, detector: Detector) -> None:
     _end_children()
 
 
-def _detector(request: dict[str, Any]) -> Detector:
+def _detector(request: dict[str, Any], packages: Sequence[Path]) -> Detector:
     gc.disable()  # collecting would take a tenth of the time in which PyTorch is imported
-    spec = offer_of(request["plugin"], request["detector"]).spec
+    spec = offer_of(request["plugin"], request["detector"], packages).spec
     arguments = {name: request[name] for name in ("seed", "horizon", "parameters")}
     detector = make_detector(spec.factory, **arguments, baseline=request.get("baseline", 0))
     gc.enable()
@@ -346,19 +346,22 @@ def _end_children() -> None:
             child.kill()
 
 
-def connect(arguments: Sequence[str]) -> Channel:
+def connect(arguments: Sequence[str]) -> tuple[Channel, list[Path]]:
     """Return the channel to the harness, from the command line of a process that it has started.
 
     Without a launcher, which ends by itself, a lifeline is named, too. The harness never writes to
-    it: reading it ends when the harness is no more.
+    it: reading it ends when the harness is no more. With one, directories of packages may follow:
+    they are returned, and the last on the import path from now on.
     """
-    descriptors = [int(a) for a in arguments]
+    descriptors = [int(a) for a in arguments if a.isdecimal()]
+    packages = arguments[len(descriptors) :]
+    sys.path += packages  # No site directory: its .pth files are not read.
     for descriptor in descriptors:
         os.set_inheritable(descriptor, False)
     for lifeline in descriptors[1:]:
         _guard(lifeline)
     faulthandler.enable()
-    return Channel(descriptors[0])
+    return Channel(descriptors[0]), [*map(Path, packages)]
 
 
 def _guard(lifeline: int) -> None:
@@ -407,8 +410,8 @@ def main(arguments: Sequence[str]) -> NoReturn:
 
     Threads and exit handlers of the detector have no say any more: the scores are sent.
     """
-    channel = connect(arguments)
-    os._exit(_reported(channel, lambda: serve(channel)))
+    channel, packages = connect(arguments)
+    os._exit(_reported(channel, lambda: serve(channel, packages)))
 
 
 if __name__ == "__main__":
