@@ -515,4 +515,3 @@ def _foreign(point: EntryPoint) -> bool:
 def distribution_of(point: EntryPoint) -> str:
     """Return the name of the distribution that pip installed."""
     return named(point.dist)[0]
-

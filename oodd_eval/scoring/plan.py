@@ -309,10 +309,10 @@ def source_digest(module: str, packages: tuple[Path, ...] = ()) -> str:
     digests: dict[str, str] = {}
     for directory in packages:
         for path in directory.rglob("*"):
-            name = path.relative_to(directory)
-            if path.is_file() and not name.parts[0].endswith(".dist-info"):
+            below = path.relative_to(directory)
+            if path.is_file() and not below.parts[0].endswith(".dist-info"):
                 with path.open("rb") as file:
-                    digests[str(name)] = hashlib.file_digest(file, "sha256").hexdigest()
+                    digests[str(below)] = hashlib.file_digest(file, "sha256").hexdigest()
     pending, seen = [] if packages else [module], {*_HARNESS}
     while pending:
         top = pending.pop().partition(".")[0]

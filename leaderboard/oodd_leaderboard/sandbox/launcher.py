@@ -1,9 +1,9 @@
 """A launcher of workers, each in a sandbox of its own, which bubblewrap makes.
 
 The worker sees the system's programs and libraries, the interpreter, what can be imported, and the
-packages that only sandboxes get, all read-only. Its home is ``/tmp``: memory of limited size, which is gone when the worker ends. It has
-no network, sees no process but its own, has no rights, and is nobody. No directory of the system
-is its to write, and none outlives it.
+packages that only sandboxes get, all read-only. Its home is ``/tmp``: memory of limited size, which
+is gone when the worker ends. It has no network, sees no process but its own, has no rights, and is
+nobody. No directory of the system is its to write, and none outlives it.
 """
 
 import functools
@@ -98,9 +98,7 @@ class Sandbox:
         return kept | dict.fromkeys(("HOME", "TMPDIR", "XDG_CACHE_HOME"), SCRATCH)
 
 
-def make_sandbox(
-    hidden: Iterable[str | Path] = (), packages: Iterable[str | Path] = ()
-) -> Sandbox:
+def make_sandbox(hidden: Iterable[str | Path] = (), packages: Iterable[str | Path] = ()) -> Sandbox:
     """Return a launcher, once a process has run in a sandbox.
 
     Raises `UsageError` if bubblewrap is not installed, or may not make a sandbox here.

@@ -16,7 +16,7 @@ from oodd_eval.plugins.installed import named, normalized
 
 MOST_DISTRIBUTIONS: Final = 200
 MOST_BYTES: Final = 10**6  # of a file of metadata
-_NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9._-]{0,98}[A-Za-z0-9])?")  # of distributions and plug-ins
+_NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9._-]{0,98}[A-Za-z0-9])?")  # also of plug-ins
 _MODULE = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*")
 _ENDINGS: Final = (".dist-info", "egg-info")  # in these Python looks for metadata
 
