@@ -104,10 +104,9 @@ class Offer:
         """Tell whether a module could be imported, by the package that it is in: nothing is."""
         top = name.partition(".")[0]
         try:
-            found = find_spec(top) or PathFinder.find_spec(top, [*map(str, self.packages)])
+            return bool(find_spec(top) or PathFinder.find_spec(top, [*map(str, self.packages)]))
         except (ImportError, ValueError, AttributeError):
             return False
-        return found is not None
 
 
 class Broken(NamedTuple):

@@ -50,11 +50,11 @@ def _is_sound(point: EntryPoint, broken: list[BrokenMetadata]) -> bool:
         return False
 
 
-def _each(found: Iterable[Distribution], broken: list[BrokenMetadata]) -> list[EntryPoint]:
+def _each(every: Iterable[Distribution], broken: list[BrokenMetadata]) -> list[EntryPoint]:
     """Return the entry points of every sound distribution, and add the others to a list."""
     # Of two with one name the first on the path counts, as it is the one that is imported.
     points: dict[str, list[EntryPoint]] = {}
-    for distribution in found:
+    for distribution in every:
         try:
             name = normalized(named(distribution)[0])
             points.setdefault(name, [*distribution.entry_points])

@@ -104,15 +104,8 @@ class DescribedPlugin:
 class _Describer:
     """Has a sandbox load the plug-ins of a distribution, all at once, when one is needed."""
 
-    def __init__(
-        self,
-        launcher: Launcher,
-        memory: int | None,
-        *,
-        disabled: Collection[str] = (),
-        packages: Sequence[Path] = (),
-    ) -> None:
-        self.plugins = discover(disabled, load=self._load, packages=packages)
+    def __init__(self, launcher: Launcher, memory: int | None, **settings: Any) -> None:
+        self.plugins = discover(load=self._load, **settings)
         self._launcher, self._limits = launcher, Limits(SECONDS, memory)
         self._answers: dict[tuple[str, str], Answer] = {}
 

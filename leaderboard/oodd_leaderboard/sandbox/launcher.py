@@ -22,6 +22,8 @@ from typing import Final
 
 from oodd_eval.errors import UsageError
 
+Paths = Iterable[str | Path]
+
 SCRATCH: Final = "/tmp"  # noqa: S108  of the sandbox, not of the system
 SCRATCH_BYTES: Final = 2 * 10**9  # of /tmp, beside --memory: the training episodes lie there
 SHARED_BYTES: Final = 256 * 10**6  # of /dev/shm
@@ -29,25 +31,10 @@ NOBODY: Final = "65534"
 PACKAGES: Final = Path("/packages")  # Numbers below it: paths of this machine may tell something.
 
 _READ_ONLY: Final = (
-    "/usr",
-    "/bin",
-    "/sbin",
-    "/lib",
-    "/lib32",
-    "/lib64",
-    "/libx32",
-    "/sys/devices/system/cpu/online",
-    "/sys/devices/system/cpu/possible",
-    "/sys/devices/system/cpu/present",
-    "/etc/alternatives",
-    "/etc/fonts",
-    "/etc/group",
-    "/etc/ld.so.cache",
-    "/etc/localtime",
-    "/etc/nsswitch.conf",
-    "/etc/passwd",
-    "/etc/timezone",
-)
+    "/usr /bin /sbin /lib /lib32 /lib64 /libx32 /etc/alternatives /etc/fonts /etc/group "
+    "/etc/ld.so.cache /etc/localtime /etc/nsswitch.conf /etc/passwd /etc/timezone "
+    "/sys/devices/system/cpu/online /sys/devices/system/cpu/possible /sys/devices/system/cpu/present"
+).split()
 _FROZEN: Final = ("cpuinfo", "filesystems", "meminfo", "stat", "version")
 """Files of /proc that libraries read: they are as they were when the command first looked.
 
@@ -55,14 +42,8 @@ Of the others, which tell what all processes of the system do, none is to be see
 """
 
 _KEPT: Final = ("LANG", "LANGUAGE", "PATH", "TZ")  # of the user's environment
-_SUFFIXES: Final = (
-    *importlib.machinery.all_suffixes(),
-    ".dist-info",
-    ".egg-info",
-    ".egg",
-    ".zip",
-    ".pth",
-)
+_METADATA: Final = (".dist-info", ".egg-info", ".egg", ".zip", ".pth")
+_SUFFIXES: Final = (*importlib.machinery.all_suffixes(), *_METADATA)
 
 
 class Sandbox:
@@ -74,7 +55,7 @@ class Sandbox:
 
     processes = 256
 
-    def __init__(self, hidden: Iterable[str | Path], packages: Iterable[str | Path] = ()) -> None:
+    def __init__(self, hidden: Paths = (), packages: Paths = ()) -> None:
         self._hidden = [Path(os.path.realpath(path)) for path in hidden]
         targets = (Path(os.path.realpath(path)) for path in packages)
         self._packages = {PACKAGES / str(i): target for i, target in enumerate(targets)}
@@ -119,18 +100,11 @@ def _run(
 ) -> tuple[int, str]:
     """Run a command that reads descriptors, which are closed; return its exit code and errors."""
     done = subprocess.run(  # noqa: S603  bubblewrap and our own interpreter
-        command,
-        pass_fds=descriptors,
-        env=environment,
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        encoding="utf-8",
-        errors="replace",
-        check=False,
+        command, pass_fds=descriptors, env=environment, input=b"", capture_output=True, check=False
     )
     for descriptor in descriptors:
         os.close(descriptor)
-    return done.returncode, done.stderr
+    return done.returncode, done.stderr.decode(errors="replace")
 
 
 @functools.cache
