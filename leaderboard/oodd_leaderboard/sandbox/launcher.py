@@ -30,11 +30,11 @@ SHARED_BYTES: Final = 256 * 10**6  # of /dev/shm
 NOBODY: Final = "65534"
 PACKAGES: Final = Path("/packages")  # Numbers below it: paths of this machine may tell something.
 
-_READ_ONLY: Final = (
-    "/usr /bin /sbin /lib /lib32 /lib64 /libx32 /etc/alternatives /etc/fonts /etc/group "
-    "/etc/ld.so.cache /etc/localtime /etc/nsswitch.conf /etc/passwd /etc/timezone "
-    "/sys/devices/system/cpu/online /sys/devices/system/cpu/possible /sys/devices/system/cpu/present"
-).split()
+_ROOT: Final = ("usr", "bin", "sbin", "lib", "lib32", "lib64", "libx32")
+_ETC: Final = ("alternatives", "fonts", "group", "ld.so.cache", "localtime", "nsswitch.conf")
+_CPU: Final = ("online", "possible", "present")
+_BELOW: Final = {"/": _ROOT, "/etc": (*_ETC, "passwd", "timezone"), "/sys/devices/system/cpu": _CPU}
+_READ_ONLY: Final = [Path(parent, name) for parent, names in _BELOW.items() for name in names]
 _FROZEN: Final = ("cpuinfo", "filesystems", "meminfo", "stat", "version")
 """Files of /proc that libraries read: they are as they were when the command first looked.
 
@@ -206,7 +206,7 @@ def _program() -> str:
 
 def _readable() -> Iterator[Path]:
     """Yield what a worker may read: the system, the interpreter, and what can be imported."""
-    yield from (Path(path) for path in _READ_ONLY if os.path.lexists(path))
+    yield from filter(os.path.lexists, _READ_ONLY)
     for prefix in (sys.base_prefix, sys.prefix, os.path.realpath(sys.base_prefix)):
         yield Path(prefix)
     yield Path(os.path.realpath(sys.executable)).parent
