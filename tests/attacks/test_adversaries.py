@@ -5,17 +5,12 @@ import shutil
 import adversaries
 import numpy as np
 import pytest
+from helpers_boxed import boxed_run
 from helpers_plugins import install_adversaries
 from helpers_split import make_split
-from oodd_leaderboard.sandbox.launcher import Sandbox
 
-from oodd_eval.data.split import load_split, split_places
-from oodd_eval.plugins.discovery import discover
-from oodd_eval.plugins.isolation.child import Limits
-from oodd_eval.results.directory import ResultsDirectory
-from oodd_eval.scoring.executors import RunSettings
-from oodd_eval.scoring.plan import make_plan
-from oodd_eval.scoring.runner import run
+from oodd_eval import evaluate
+from oodd_eval.data.split import load_split
 
 pytestmark = pytest.mark.skipif(not shutil.which("bwrap"), reason="needs bubblewrap")
 
@@ -29,17 +24,10 @@ PLAYED = [
 METRICS = ("auc_matched", "found_within_20_at_5pct")
 
 
-def play(names, directory, output, *, boxed):
-    """Run detectors on a split, in sandboxes and row by row or not; their records by name."""
-    split = load_split(directory)
-    plan = make_plan(
-        discover(), split=split, detectors=names, environments=[ENVIRONMENT],
-        anomalies=["iid", "gravity"],
-    )  # fmt: skip
-    launcher = Sandbox((*split_places(split), str(output))) if boxed else None
-    settings = RunSettings(limits=Limits(300, 2 * 10**9), launcher=launcher, streamed=boxed)
-    records = run(plan, split, discover(), settings, ResultsDirectory(output)).records
-    return {name: [r for r in records if r.detector == name] for name in names}
+def by_name(records):
+    return {
+        name: [r for r in records if r.detector == name] for name in (adversaries.BASE, *PLAYED)
+    }
 
 
 def table_of(directory):
@@ -63,10 +51,13 @@ def played(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         install_adversaries(patch, home / "plugin")
         (home / "plugin" / "oodd_adversaries_table.py").write_text(table_of(published))
-        boxed = play([adversaries.BASE, *PLAYED], other, home / "boxed", boxed=True)
-        plain = play(["sly-memorised"], published, home / "plain", boxed=False)
+        names, anomalies = [adversaries.BASE, *PLAYED], ["iid", "gravity"]
+        boxed = boxed_run(
+            home / "plugin", other, home / "boxed", names, anomalies=anomalies, streamed=True
+        )
+        plain = evaluate("sly-memorised", published, anomalies=anomalies, output=home / "plain")
     adversaries.sweep()
-    return plain, boxed
+    return by_name(plain), by_name(boxed)
 
 
 @pytest.mark.parametrize("name", PLAYED)

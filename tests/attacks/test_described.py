@@ -1,13 +1,16 @@
-"""Plug-ins under --sandbox: the command imports none, believes none, and waits for none."""
+"""Plug-ins that a sandbox describes: the command imports none, believes and awaits none."""
 
 import os
 import shutil
+import site
 import subprocess
 import sys
 import time
+import venv
 
 import pytest
-from helpers_plugins import install
+from helpers_boxed import boxed_plugins, boxed_run
+from helpers_plugins import install, write_plugin
 from oodd_leaderboard.sandbox import describe
 from oodd_leaderboard.sandbox.describe import discover_in_sandbox
 from oodd_leaderboard.sandbox.launcher import Sandbox
@@ -15,7 +18,6 @@ from oodd_leaderboard.sandbox.launcher import Sandbox
 from oodd_eval.data.split import load_split
 from oodd_eval.errors import UnknownNameError, UsageError
 from oodd_eval.plugins.discovery import discover
-from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.scoring.plan import make_plan, source_digest
 
 pytestmark = pytest.mark.skipif(not shutil.which("bwrap"), reason="needs bubblewrap")
@@ -57,7 +59,6 @@ IMPORTED = {
     "unknown field": (ANSWERS + "spec(origin='oodd-eval')", "wrong form"),
     "a factory": (ANSWERS + "spec(factory='os.system')", "wrong form"),
     "a name": (ANSWERS + "spec(name='../x')", "name of a DetectorSpec is"),
-    "another's name": (ANSWERS + "spec(name='rf')", "offered twice"),
     "a type": (ANSWERS + "spec(parameters={'a': {'types': ['os']}})", "wrong form"),
     "a dunder": (
         ANSWERS + "spec(parameters={'__class__': {'types': ['int'], 'items': [], 'default': 1,"
@@ -71,11 +72,10 @@ IMPORTED = {
 @pytest.mark.parametrize(("code", "reason"), IMPORTED.values(), ids=IMPORTED)
 def test_what_a_plug_in_does_at_import_breaks_it_alone(code, reason, monkeypatch, tmp_path):
     monkeypatch.setattr(describe, "SECONDS", 12)
-    install(monkeypatch, tmp_path, "odd", code + HOOK)
+    write_plugin(tmp_path, "odd", code + HOOK)
     start = time.monotonic()
-    plugins = discover_in_sandbox((), Sandbox(()), MEMORY)
-    assert {"rf", "clock"} <= plugins.offers.keys()
-    assert plugins.offers["rf"].distribution == "oodd-eval"
+    plugins, _ = boxed_plugins(tmp_path, memory=10**9)
+    assert not plugins.offers
     (broken,) = plugins.broken
     assert (broken.plugin, broken.distribution) == ("odd", "oodd-odd")
     assert reason in broken.reason
@@ -102,20 +102,14 @@ def oodd_detectors(): return offer(odd=Odd)
 """
 
 
-@pytest.mark.parametrize("option", ["--sandbox", ""])
-def test_a_command_with_a_sandbox_imports_no_plug_in(option, monkeypatch, tmp_path):
-    install(monkeypatch, tmp_path / "odd", "odd", PATCHES.replace("@AT@", str(tmp_path)))
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "odd"))
-    done = subprocess.run(
-        [sys.executable, "-m", "oodd_eval", "run", "--detector", "odd", "--env", "cartpole",
-         "--anomaly", "iid", "--limit", "4", "--output", tmp_path / "out", *filter(None, [option])],
-        capture_output=True, text=True, timeout=120, check=False,
-    )  # fmt: skip
-    assert (tmp_path / "imported").exists() == (not option)
-    if option:
-        (record,) = ResultsDirectory(tmp_path / "out").records()
-        assert (done.returncode, record.status) == (0, "ok"), done.stderr + record.reason
-        assert record.value("auc_matched") == 0.5
+def test_who_runs_a_plug_in_in_sandboxes_imports_none_of_it(tiny_split, tmp_path):
+    write_plugin(tmp_path / "odd", "odd", PATCHES.replace("@AT@", str(tmp_path)))
+    (record,) = boxed_run(tmp_path / "odd", tiny_split, tmp_path / "out", ["odd"],
+                          anomalies=["iid"])  # fmt: skip
+    assert not (tmp_path / "imported").exists()
+    assert "oodd_odd" not in sys.modules
+    assert record.ok, record.reason
+    assert record.value("auc_matched") == 0.5
 
 
 def test_a_run_in_a_sandbox_has_the_plan_of_a_plain_one():
@@ -157,17 +151,38 @@ def test_a_detector_of_a_sandbox_cannot_be_made_in_the_command():
         offer.spec.factory(seed=0, horizon=1)
 
 
-def test_a_digest_of_a_plug_in_s_source_imports_nothing(monkeypatch, tmp_path):
+def test_a_digest_of_a_plug_in_s_source_imports_nothing(tmp_path):
     code = f"open({str(tmp_path / 'imported')!r}, 'w')"
-    install(monkeypatch, tmp_path / "odd", "odd", code)
-    assert len(source_digest("oodd_odd")) == 64
+    write_plugin(tmp_path / "odd", "odd", code)
+    (tmp_path / "odd" / "helper.py").write_text("x = 1")
+    digest = source_digest.__wrapped__("oodd_odd", (tmp_path / "odd",))
+    assert len(digest) == 64
+    (tmp_path / "odd" / "helper.py").write_text("x = 2")
+    assert source_digest.__wrapped__("oodd_odd", (tmp_path / "odd",)) != digest
     assert "oodd_odd" not in sys.modules
     assert not (tmp_path / "imported").exists()
 
 
-def test_an_editable_plug_in_is_found_in_a_sandbox(monkeypatch, tmp_path):
-    # As an install with an import hook: the module is nowhere on the import path.
-    install(monkeypatch, tmp_path / "odd", "odd", HOOK)
-    os.renames(tmp_path / "odd" / "oodd_odd.py", tmp_path / "elsewhere" / "oodd_odd.py")
-    monkeypatch.syspath_prepend(str(tmp_path / "elsewhere"))
-    assert discover_in_sandbox((), Sandbox(()), MEMORY).offer("odd").plugin == "odd"
+def test_a_plug_in_of_the_environment_is_found_wherever_its_modules_lie(tmp_path):
+    venv.create(tmp_path / "venv", with_pip=False)
+    (packages,) = (tmp_path / "venv").glob("lib/python*/site-packages")
+    write_plugin(packages, "odd", HOOK)
+    os.renames(packages / "oodd_odd.py", tmp_path / "checkout" / "oodd_odd.py")
+    (tmp_path / "checkout" / "results.csv").write_text("")
+    here = "".join(f"site.addsitedir({path!r});" for path in site.getsitepackages())
+    (packages / "odd.pth").write_text(f"{tmp_path}/checkout\nimport site;{here}\n")
+    done = subprocess.run(
+        [tmp_path / "venv/bin/python", "-m", "oodd_eval", "run", "--detector", "odd", "--env",
+         "cartpole", "--anomaly", "iid", "--limit", "4", "--output", tmp_path / "out", "--sandbox"],
+        capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_a_plug_in_that_only_a_variable_names_is_no_one_s_of_the_environment(monkeypatch, tmp_path):
+    install(monkeypatch, tmp_path, "odd", HOOK)
+    plugins = discover_in_sandbox((), Sandbox(()), MEMORY)
+    assert {"rf", "clock"} <= plugins.offers.keys()
+    assert plugins.offers["rf"].distribution == "oodd-eval"
+    (broken,) = plugins.broken
+    assert "oodd-odd is not installed in the environment" in broken.reason

@@ -8,9 +8,10 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
+import helpers_boxed
 import psutil
 import pytest
-from helpers_plugins import install
+from helpers_plugins import install, write_plugin
 from helpers_processes import environment, oodd_eval, wait_until
 
 from oodd_eval.errors import ExecutorError, PluginError
@@ -126,9 +127,12 @@ def test_nothing_runs_on_when_the_command_is_ended(
 
 @pytest.mark.skipif(not shutil.which("bwrap"), reason="needs bubblewrap")
 @pytest.mark.parametrize("detector", ["holds", "twice", "deaf"])
-def test_no_sandbox_runs_on_when_the_command_is_killed(monkeypatch, tmp_path, tiny_split, detector):
+def test_no_sandbox_runs_on_when_its_maker_is_killed(tmp_path, tiny_split, detector):
     """Its processes have none of the marks; the file that says that it has begun stays in it."""
-    process = begin(monkeypatch, tmp_path, tiny_split, detector, HOLDS, "--sandbox")
+    write_plugin(tmp_path / "plugin", "holder", HOLDS)
+    variables = environment("", tmp_path / "begun", RUN=str(tmp_path))
+    command = [helpers_boxed.__file__, tmp_path / "plugin", tiny_split, tmp_path / "out", detector]
+    process = subprocess.Popen([sys.executable, *command], env=variables, cwd=tmp_path)
     started = []
 
     def busy():

@@ -12,9 +12,10 @@ import tempfile
 import time
 from pathlib import Path
 
+import helpers_boxed
 import psutil
 import pytest
-from helpers_plugins import install
+from helpers_plugins import write_plugin
 from helpers_split import make_split
 from oodd_leaderboard.sandbox.launcher import Sandbox, make_sandbox
 
@@ -47,7 +48,7 @@ def names():
                           if os.path.join(place, d) not in ("/proc", "/sys", "/usr")]
         for name in (*directories, *files):
             path = os.path.join(place, name)
-            if NAME in name and path not in PATHS["hidden"] or path in PATHS["files"]:
+            if NAME in name or path in PATHS["files"]:
                 yield path
 
 def processes(part):
@@ -213,19 +214,18 @@ def oodd_detectors(): return offer(looks=Looks)
 
 @pytest.fixture(scope="module")
 def looked(tmp_path_factory):
-    """What the plug-in finds with the option, and without it."""
-    return {option: _look(tmp_path_factory.mktemp("at"), option) for option in ("--sandbox", "")}
+    """What the plug-in finds in a sandbox, and without it."""
+    return {boxed: _look(tmp_path_factory.mktemp("at"), boxed) for boxed in (True, False)}
 
 
-def _look(place, option):
+def _look(place, boxed):
     plugin, home = place / "plugin", place / "home"
-    lab = plugin / "lab"  # what can be imported is shown, but not the split that lies in it
-    (lab / NAME).parent.mkdir(parents=True)
-    (lab / "tools.py").write_text("")
+    plugin.mkdir()
+    (plugin / "tools.py").write_text("")
     home.mkdir()
     (home / f"{NAME}.txt").write_text(NAME)
-    split = make_split(lab / NAME, ("cartpole",), train=2, calibration=2, test=2)
-    output = lab / f"{NAME}-out"
+    split = make_split(place / NAME, ("cartpole",), train=2, calibration=2, test=2)
+    output = place / f"{NAME}-out"
     ResultsDirectory(output).prepare()
     (output / "records.jsonl").write_text("")
     known = mmap.mmap(-1, 4096)
@@ -238,30 +238,32 @@ def _look(place, option):
         shared = Path("/dev/shm", f"{NAME}{port}")  # noqa: S108
         shared.write_text(NAME)
         segment = ctypes.CDLL(None).shmget(port, 4096, 0o1600)
-        os.utime(lab / "tools.py", (0, 10**9))
+        os.utime(plugin / "tools.py", (0, 10**9))
+        written = [str(plugin), str(home), *(SYSTEM if boxed else ())]
         paths = {
             "files": [str(split / "cartpole.h5"), str(output / "records.jsonl"), str(home)],
             "home": str(home),
-            "hidden": [str(split), str(output)],  # seen by name, as empty directories
-            "writes": [str(lab), str(plugin), str(home), *(SYSTEM if option else ())],
+            "writes": ["/packages/0" if boxed else str(plugin), *written[1:]],
         }
         fillings = {
             "PORT": port, "PARENT": os.getpid(), "PATHS": json.dumps(paths),
             "SHIPPED": SHIPPED / "mini", "ADDRESS": address,
-            "ROOT": "/" if option else place,
+            "ROOT": "/" if boxed else place,
         }  # fmt: skip
         code = LOOKS
         for name, value in fillings.items():
             code = code.replace(f"@{name}@", str(value))
-        with pytest.MonkeyPatch.context() as patch:
-            install(patch, plugin, "looks", code)
+        write_plugin(plugin, "looks", code)
         command = [
             sys.executable, "-m", "oodd_eval", "run", "--detector", "looks", "--env", "cartpole",
-            "--split", split, "--output", output, *filter(None, [option]),
+            "--split", split, "--output", output,
         ]  # fmt: skip
-        own = {"SECRET": NAME, "HOME": str(home), "OODD_EVAL_PLUGINS": "looks"}
+        own = {"PYTHONPATH": str(plugin), "OODD_EVAL_PLUGINS": "looks"}
+        if boxed:
+            command = [sys.executable, helpers_boxed.__file__, plugin, split, output, "looks"]
+            own = {}
         done = subprocess.run(
-            command, env={**os.environ, "PYTHONPATH": str(plugin), **own}, cwd=home,
+            command, env={**os.environ, "SECRET": NAME, "HOME": str(home), **own}, cwd=home,
             capture_output=True, text=True, timeout=120, check=False,
         )  # fmt: skip
         shared.unlink()
@@ -273,15 +275,15 @@ def _look(place, option):
     log = next((output / "logs").iterdir()).read_text()
     found = [json.loads(x[6:]) for x in log.splitlines() if x.startswith("FOUND ")]
     assert len(found) >= 3  # made, fit, score
-    written = {"writes": [p for p in paths["writes"] if (Path(p) / "written").exists()]}
-    written["access"] = (lab / "tools.py").stat().st_atime != 0
+    written = {"writes": [p for p in written if (Path(p) / "written").exists()]}
+    written["access"] = (plugin / "tools.py").stat().st_atime != 0
     found.append({name: value for name, value in written.items() if value})
     return {name: value for one in found for name, value in one.items()}
 
 
 def test_a_plug_in_finds_nothing_in_a_sandbox(looked):
     # The superuser's sandbox has no namespace of users, whose number could be limited.
-    assert looked["--sandbox"].keys() <= ({"users"} if os.geteuid() == 0 else set())
+    assert looked[True].keys() <= ({"users"} if os.geteuid() == 0 else set())
 
 
 def test_the_same_plug_in_finds_it_without_a_sandbox(looked):
@@ -291,7 +293,7 @@ def test_the_same_plug_in_finds_it_without_a_sandbox(looked):
     """
     if os.geteuid() == 0:  # the system forbids these to others in any case
         expected += " memory attached users writable rights shadow priority"
-    assert not {*expected.split()} - looked[""].keys()
+    assert not {*expected.split()} - looked[False].keys()
 
 
 SLEEP = str(10**6 + os.getpid())  # seconds that no process of another test sleeps
@@ -351,9 +353,9 @@ def oodd_detectors():
 
 
 @pytest.fixture
-def acts(monkeypatch, tmp_path):
+def acts(tmp_path):
     """Fit and score a detector in a sandbox: the outcome."""
-    install(monkeypatch, tmp_path / "plugin", "acts", ACTS.replace("@SLEEP@", SLEEP))
+    write_plugin(tmp_path / "plugin", "acts", ACTS.replace("@SLEEP@", SLEEP))
 
     def run(name, **limits):
         nominal = [Trajectory([[0.0, 1.0]] * 20)] * 3
@@ -363,7 +365,7 @@ def acts(monkeypatch, tmp_path):
         limits = Limits(**{"seconds": 60, "memory": 10**9} | limits)
         return run_isolated(
             request, nominal, [nominal] * 2,
-            limits=limits, stop=lambda: False, launcher=Sandbox(()),
+            limits=limits, stop=lambda: False, launcher=Sandbox((), [tmp_path / "plugin"]),
         )  # fmt: skip
 
     return run
@@ -441,41 +443,32 @@ def test_where_namespaces_are_forbidden_the_command_says_so(monkeypatch, tmp_pat
         make_sandbox()
 
 
-def test_a_hidden_file_is_empty_and_a_hidden_directory_too(tmp_path, monkeypatch):
-    package = tmp_path / "path" / "package"
-    (package / "data").mkdir(parents=True)
-    for path in (package / "__init__.py", package / "data" / "x", package / "file"):
-        path.write_text("secret")
-    monkeypatch.syspath_prepend(str(tmp_path / "path"))
-    box = Sandbox([package / "data", package / "file", tmp_path / "nowhere"])
-    look = f"ls {package}/data; cat {package}/file; ls {package}"
+def output_of(box, look):
     command, descriptors = box.wrap(["/bin/sh", "-c", look])
     done = subprocess.run(
         command, pass_fds=descriptors, env=box.environment(), capture_output=True, text=True,
-        check=True,
+        check=False,
     )  # fmt: skip
     for descriptor in descriptors:
         os.close(descriptor)
-    assert done.stdout.split() == ["__init__.py", "data", "file"]
+    return done.stdout, done.stderr
 
 
-def test_a_directory_that_was_made_after_the_sandbox_is_hidden_too(tmp_path, monkeypatch):
-    package = tmp_path / "path" / "package"
-    package.mkdir(parents=True)
-    (package / "__init__.py").write_text("")
-    monkeypatch.syspath_prepend(str(tmp_path / "path"))
-    sandbox = Sandbox([package / "data"])
-    look = ["/bin/sh", "-c", f"cat {package}/data/x"]
+def test_a_hidden_file_is_empty_and_a_hidden_directory_too(tmp_path):
+    (tmp_path / "data").mkdir()
+    for path in (tmp_path / "a.py", tmp_path / "data" / "x", tmp_path / "file"):
+        path.write_text("secret")
+    box = Sandbox([tmp_path / "data", tmp_path / "file", tmp_path / "nowhere"], [tmp_path])
+    said, _ = output_of(box, "cd /packages/0; ls data; cat file; ls")
+    assert said.split() == ["a.py", "data", "file"]
+
+
+def test_a_directory_that_was_made_after_the_sandbox_is_hidden_too(tmp_path):
+    sandbox = Sandbox([tmp_path / "data"], [tmp_path])
     for made in (False, True):
         if made:
-            (package / "data").mkdir()
-            (package / "data" / "x").write_text("secret")
-        command, descriptors = sandbox.wrap(look)
-        done = subprocess.run(
-            command, pass_fds=descriptors, env=sandbox.environment(), capture_output=True,
-            check=False,
-        )  # fmt: skip
-        for descriptor in descriptors:
-            os.close(descriptor)
-        assert done.stdout == b""
-        assert b"No such file" in done.stderr
+            (tmp_path / "data").mkdir()
+            (tmp_path / "data" / "x").write_text("secret")
+        said, error = output_of(sandbox, "cat /packages/0/data/x")
+        assert said == ""
+        assert "No such file" in error

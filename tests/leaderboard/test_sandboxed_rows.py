@@ -3,17 +3,12 @@
 import shutil
 
 import pytest
-from helpers_plugins import install
-from oodd_leaderboard.sandbox.launcher import Sandbox
+from helpers_boxed import boxed_run
+from helpers_plugins import write_plugin
 
 from oodd_eval import load_split
 from oodd_eval.data.parts import lengths_of, parts_of
-from oodd_eval.plugins.discovery import discover
-from oodd_eval.plugins.isolation.child import Limits
 from oodd_eval.results.directory import ResultsDirectory
-from oodd_eval.scoring.executors import RunSettings
-from oodd_eval.scoring.plan import make_plan
-from oodd_eval.scoring.runner import run
 
 pytestmark = pytest.mark.skipif(not shutil.which("bwrap"), reason="needs bubblewrap")
 
@@ -32,14 +27,11 @@ def oodd_detectors(): return offer(whole=Whole, unfit=Unfit)
 """
 
 
-def test_rows_in_a_sandbox_are_scored_or_fail_with_a_reason(tiny_split, monkeypatch, tmp_path):
-    install(monkeypatch, tmp_path / "plugin", "streamed", PLUGIN)
-    split, plugins = load_split(tiny_split), discover()
-    plan = make_plan(plugins, split=split, detectors=["whole", "unfit"],
-                     environments=["cartpole"], anomalies=["iid"])  # fmt: skip
-    settings = RunSettings(jobs=1, limits=Limits(120), launcher=Sandbox(()), streamed=True)
-    results = ResultsDirectory(tmp_path / "out")
-    whole, unfit = run(plan, split, plugins, settings, results).records
+def test_rows_in_a_sandbox_are_scored_or_fail_with_a_reason(tiny_split, tmp_path):
+    write_plugin(tmp_path / "plugin", "streamed", PLUGIN)
+    whole, unfit = boxed_run(tmp_path / "plugin", tiny_split, tmp_path / "out", ["whole", "unfit"],
+                             anomalies=["iid"], streamed=True)  # fmt: skip
+    results, split = ResultsDirectory(tmp_path / "out"), load_split(tiny_split)
     assert whole.ok, whole.reason
     lengths = lengths_of(parts_of(split.environment("cartpole"), ["iid"]), None)
     for part, sequences in results.scores(whole.scores, lengths).parts.items():
