@@ -4,7 +4,7 @@
 [--test 20] [--cap 200] [NAME ...]``
 builds two small splits: one whose seeds and twins are known, as a published split's are, and one of
 seeds drawn now. It runs the honest detector and each adversary on the first as a plain run does,
-which trusts them, and on the second in sandboxes, row by row. Exit code 1 when one gains there: its
+which trusts them, and on the second as packages of a stranger in sandboxes, row by row. Exit code 1 when one gains there: its
 matched AUC or its share found within 20 rows lies above the honest detector's interval, and the
 honest one's below its own, over all or in an environment.
 """
@@ -27,7 +27,8 @@ sys.path[:] = [str(TESTS), *(path for path in sys.path if path != HERE)]  # it h
 
 import adversaries  # noqa: E402
 from helpers_plugins import install_adversaries  # noqa: E402
-from oodd_leaderboard.sandbox.launcher import Sandbox  # noqa: E402
+from oodd_leaderboard.sandbox.describe import discover_entry  # noqa: E402
+from oodd_leaderboard.sandbox.launcher import make_sandbox  # noqa: E402
 from oodd_recording.build import build_split, digest_of_bits  # noqa: E402
 
 from oodd_eval.data.facts import CUSTOM_SEED_BASES, SPLITS, SplitDefinition  # noqa: E402
@@ -66,16 +67,20 @@ def table_of(split):
     return f"CELLS = {known.tobytes().hex()!r}\n"
 
 
-def play(names, anomalies, directory, output, *, sandboxed):
+def play(names, anomalies, directory, output, *, packages=None):
     """Run detectors on a split, in a process of its own: one of them patches its process."""
-    split = load_split(directory)
+    split, launcher, plugins = load_split(directory), None, discover()
+    if packages:
+        launcher = make_sandbox((*split_places(split), str(output)), [packages])
+        plugins = discover_entry(packages, launcher, MEMORY)
     plan = make_plan(
-        discover(), split=split, detectors=names, anomalies=anomalies,
+        plugins, split=split, detectors=names, anomalies=anomalies,
         environments=[*split.environments],
     )  # fmt: skip
-    launcher = Sandbox((*split_places(split), str(output))) if sandboxed else None
-    settings = RunSettings(limits=Limits(SECONDS, MEMORY), launcher=launcher, streamed=sandboxed)
-    run(plan, split, discover(), settings, ResultsDirectory(output))
+    settings = RunSettings(
+        limits=Limits(SECONDS, MEMORY), launcher=launcher, streamed=launcher is not None
+    )
+    run(plan, split, plugins, settings, ResultsDirectory(output))
 
 
 def isolated(*arguments, **more):
@@ -148,8 +153,8 @@ def main():
         try:
             for batch in batches(options.names):
                 if not options.sandboxed_only:
-                    isolated(batch, anomalies, published, plain, sandboxed=False)
-                isolated(batch, anomalies, drawn, again, sandboxed=True)
+                    isolated(batch, anomalies, published, plain)
+                isolated(batch, anomalies, drawn, again, packages=home / "plugin")
                 boards = [None if options.sandboxed_only else board_of(plain), board_of(again)]
                 gained += sum(told(*boards, name, options.verbose) for name in batch)
         finally:

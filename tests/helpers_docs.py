@@ -39,6 +39,7 @@ NOT_RUN = [
     ),
     Rule(r"^\. \.venv/bin/activate$", "the environment is this one; test_walk makes another"),
     Rule(r"^git ", "changes a repository"),
+    Rule(r"^podman |^python -m build --wheel$", "needs the image of a registry"),
     Rule(
         r"^(export|pip download|python -m zipfile) |^pip install -e examples/oodd-go1",
         "gets a robot that others published",
@@ -173,7 +174,7 @@ class Session:
         return main(arguments)
 
     def _process(self, words):
-        """Run a program of this environment; words such as ``PYTHONPATH=.`` come before it."""
+        """Run a program of this environment; words such as ``NAME=value`` come before it."""
         env = dict(os.environ)
         while re.match(r"[A-Z_]+=", words[0]):
             name, _, value = words.pop(0).partition("=")

@@ -237,8 +237,8 @@ def _no_module(name: str, spec: str) -> UsageError:
         there = [p.stem for p in directory.iterdir() if p.stem[0] not in "_."]
         return UnknownNameError(f"module of {parent}", last, there)
     return UsageError(
-        f"{spec!r} cannot be imported: there is no module {name!r}; install what holds it, or name "
-        "the directory of your own module in the environment variable PYTHONPATH"
+        f"{spec!r} cannot be imported: there is no module {name!r}; install what holds it, or call "
+        "`python -m oodd_eval` in the directory of your own module"
     )
 
 
