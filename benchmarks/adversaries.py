@@ -4,9 +4,9 @@
 [--test 20] [--cap 200] [NAME ...]``
 builds two small splits: one whose seeds and twins are known, as a published split's are, and one of
 seeds drawn now. It runs the honest detector and each adversary on the first as a plain run does,
-which trusts them, and on the second as packages of a stranger in sandboxes, row by row. Exit code 1 when one gains there: its
-matched AUC or its share found within 20 rows lies above the honest detector's interval, and the
-honest one's below its own, over all or in an environment.
+which trusts them, and on the second in sandboxes, row by row, as packages of a stranger. Exit code
+1 when one gains there: its matched AUC or its share found within 20 rows lies above the honest
+detector's interval, and the honest one's below its own, over all or in an environment.
 """
 
 import argparse
@@ -26,7 +26,7 @@ HERE = str(Path(__file__).parent)
 sys.path[:] = [str(TESTS), *(path for path in sys.path if path != HERE)]  # it has libraries' names
 
 import adversaries  # noqa: E402
-from helpers_plugins import install_adversaries  # noqa: E402
+from helpers_plugins import install_adversaries, write_adversaries  # noqa: E402
 from oodd_leaderboard.sandbox.describe import discover_entry  # noqa: E402
 from oodd_leaderboard.sandbox.launcher import make_sandbox  # noqa: E402
 from oodd_recording.build import build_split, digest_of_bits  # noqa: E402
@@ -140,20 +140,21 @@ def main():
     options = parser.parse_args()
     environments, anomalies = options.env.split(","), options.anomaly.split(",")
     start = time.monotonic()
-    with tempfile.TemporaryDirectory() as directory, pytest.MonkeyPatch.context() as patch:
+    with tempfile.TemporaryDirectory() as directory:
         home = Path(directory)
         sizes = {"test": options.test, "cap": options.cap}
         published = build(home, "published", environments, **sizes, drawn=False)
         drawn = build(home, "drawn", environments, **sizes, drawn=True)
-        install_adversaries(patch, home / "plugin")
-        (home / "plugin" / "oodd_adversaries_table.py").write_text(table_of(load_split(published)))
+        write_adversaries(home / "plugin", table_of(load_split(published)))
         plain, again, gained = home / "plain", home / "again", 0
         title = f"{'adversary':26} {'plain':>13} {'sandboxed':>13}"
         print(f"{title}  (matched AUC, found within 20, in %)")
         try:
             for batch in batches(options.names):
                 if not options.sandboxed_only:
-                    isolated(batch, anomalies, published, plain)
+                    with pytest.MonkeyPatch.context() as patch:
+                        install_adversaries(patch, home / "plugin")
+                        isolated(batch, anomalies, published, plain)
                 isolated(batch, anomalies, drawn, again, packages=home / "plugin")
                 boards = [None if options.sandboxed_only else board_of(plain), board_of(again)]
                 gained += sum(told(*boards, name, options.verbose) for name in batch)

@@ -2,8 +2,8 @@
 
 Each is `Honest`, or blind, with one cheat. Where the cheat works it gains; where it does not, the
 scores are those of `Honest`. `ADVERSARIES` is the table of all, by kind. This module is a plug-in:
-`helpers_plugins.install_adversaries` installs it, with a table of a published split's twins where
-there is one (module ``oodd_adversaries_table``). `sweep` removes what plain runs leave behind.
+`helpers_plugins.write_adversaries` writes it as a package, with a table of a published split's
+twins (module ``oodd_adversaries_table``). `sweep` removes what plain runs leave behind.
 """
 
 import array

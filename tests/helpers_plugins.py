@@ -55,6 +55,14 @@ def install(monkeypatch, path, name, code, **settings):
     return file
 
 
+def write_adversaries(path, table):
+    """Write `adversaries.py` into a directory of packages, with a table of a split's twins."""
+    write_plugin(
+        path, "adversaries", Path(__file__).with_name("adversaries.py").read_text(), header=""
+    )
+    (path / "oodd_adversaries_table.py").write_text(table)
+
+
 def install_adversaries(monkeypatch, path, code=""):
     """Install `adversaries.py` as a plug-in, or other code, here and in processes started here."""
     code = code or Path(__file__).with_name("adversaries.py").read_text()

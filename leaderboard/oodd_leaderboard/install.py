@@ -123,7 +123,7 @@ def _requirement(entry: Entry, directory: Path, work: Path) -> str:
     _check_digest(entry, hashlib.sha256(content).hexdigest())
     copy.write_bytes(content)
     _check_content([copy])
-    return str(copy)
+    return f"{copy.as_uri()}#sha256={entry.sha256}"
 
 
 def _check_digest(entry: Entry, digest: str) -> None:
@@ -151,13 +151,13 @@ def _check_content(wheels: Iterable[Path]) -> None:
 
 def _files(work: Path, *arguments: str) -> list[_File]:
     """Return the files that pip would install beside what is installed here."""
-    files = []
-    for item in json.loads(_pip(work, "install", "--dry-run", "--report", "-", *arguments))[
-        "install"
-    ]:
+    report, files = json.loads(_pip(work, "install", "--dry-run", "--report", "-", *arguments)), []
+    for item in report["install"]:
         metadata, source = item["metadata"], item["download_info"]
-        digest, url = source.get("archive_info", {}).get("hashes", {}).get("sha256"), source["url"]
-        if not digest or not url.endswith(".whl") or not url.isprintable() or " " in url:
+        archive, url = source.get("archive_info", {}), source["url"]
+        # Before version 23.1 pip told one digest, in another form.
+        hashes = archive.get("hashes") or dict([archive.get("hash", "=").split("=", 1)])
+        if not (digest := hashes.get("sha256")) or not re.fullmatch(r"[!-~]+\.whl", url):
             raise InstallError(f"{metadata['name']} comes from {url!r:.200}, expected a wheel")
         requires = metadata.get("requires_dist", [])
         files.append(_File(metadata["name"], metadata["version"], digest, url, requires))

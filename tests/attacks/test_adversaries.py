@@ -6,7 +6,7 @@ import adversaries
 import numpy as np
 import pytest
 from helpers_boxed import boxed_run
-from helpers_plugins import install_adversaries
+from helpers_plugins import install_adversaries, write_adversaries
 from helpers_split import make_split
 
 from oodd_eval import evaluate
@@ -48,13 +48,13 @@ def played(tmp_path_factory):
         make_split(home / name, (ENVIRONMENT,), **sizes, seed_base=base, name=name)
         for name, base in (("published", 11), ("other", 12))
     )
+    names, anomalies = [adversaries.BASE, *PLAYED], ["iid", "gravity"]
+    write_adversaries(home / "plugin", table_of(published))
+    boxed = boxed_run(
+        home / "plugin", other, home / "boxed", names, anomalies=anomalies, streamed=True
+    )
     with pytest.MonkeyPatch.context() as patch:
         install_adversaries(patch, home / "plugin")
-        (home / "plugin" / "oodd_adversaries_table.py").write_text(table_of(published))
-        names, anomalies = [adversaries.BASE, *PLAYED], ["iid", "gravity"]
-        boxed = boxed_run(
-            home / "plugin", other, home / "boxed", names, anomalies=anomalies, streamed=True
-        )
         plain = evaluate("sly-memorised", published, anomalies=anomalies, output=home / "plain")
     adversaries.sweep()
     return by_name(plain), by_name(boxed)

@@ -30,6 +30,7 @@ pytestmark = pytest.mark.skipif(not shutil.which("bwrap"), reason="needs bubblew
 
 SYSTEM = sys.prefix, "/usr", "/etc", "/"
 NAME = "verysecret"  # in the path of the split, in files, variables, arguments and sockets
+TOOLS = "oodd_looks-1.0.dist-info/tools.py"  # that no digest covers, so that nobody else reads it
 LOOKS = '''
 import ctypes, pwd, resource, socket
 
@@ -200,7 +201,7 @@ class Looks(Good):
         print("FOUND", json.dumps({k: str(v)[:300] for k, v in found.items() if v}), flush=True)
     def fit(self, nominal):
         self.look()
-        quiet((Path(PATHS["writes"][0]) / "tools.py").read_text)
+        quiet((Path(PATHS["writes"][0]) / "@TOOLS@").read_text)
         for place in PATHS["writes"]:
             quiet(lambda: writes(place))
     def score(self, x):
@@ -220,8 +221,9 @@ def looked(tmp_path_factory):
 
 def _look(place, boxed):
     plugin, home = place / "plugin", place / "home"
-    plugin.mkdir()
-    (plugin / "tools.py").write_text("")
+    tools = plugin / TOOLS
+    tools.parent.mkdir(parents=True)
+    tools.write_text("")
     home.mkdir()
     (home / f"{NAME}.txt").write_text(NAME)
     split = make_split(place / NAME, ("cartpole",), train=2, calibration=2, test=2)
@@ -238,7 +240,7 @@ def _look(place, boxed):
         shared = Path("/dev/shm", f"{NAME}{port}")  # noqa: S108
         shared.write_text(NAME)
         segment = ctypes.CDLL(None).shmget(port, 4096, 0o1600)
-        os.utime(plugin / "tools.py", (0, 10**9))
+        os.utime(tools, (0, 10**9))
         written = [str(plugin), str(home), *(SYSTEM if boxed else ())]
         paths = {
             "files": [str(split / "cartpole.h5"), str(output / "records.jsonl"), str(home)],
@@ -247,7 +249,7 @@ def _look(place, boxed):
         }
         fillings = {
             "PORT": port, "PARENT": os.getpid(), "PATHS": json.dumps(paths),
-            "SHIPPED": SHIPPED / "mini", "ADDRESS": address,
+            "TOOLS": TOOLS, "SHIPPED": SHIPPED / "mini", "ADDRESS": address,
             "ROOT": "/" if boxed else place,
         }  # fmt: skip
         code = LOOKS
@@ -276,7 +278,7 @@ def _look(place, boxed):
     found = [json.loads(x[6:]) for x in log.splitlines() if x.startswith("FOUND ")]
     assert len(found) >= 3  # made, fit, score
     written = {"writes": [p for p in written if (Path(p) / "written").exists()]}
-    written["access"] = (plugin / "tools.py").stat().st_atime != 0
+    written["access"] = tools.stat().st_atime != 0
     found.append({name: value for name, value in written.items() if value})
     return {name: value for one in found for name, value in one.items()}
 
@@ -455,10 +457,11 @@ def output_of(box, look):
 
 
 def test_a_hidden_file_is_empty_and_a_hidden_directory_too(tmp_path):
-    (tmp_path / "data").mkdir()
-    for path in (tmp_path / "a.py", tmp_path / "data" / "x", tmp_path / "file"):
+    packages = tmp_path / "packages"
+    (packages / "data").mkdir(parents=True)
+    for path in (packages / "a.py", packages / "data" / "x", packages / "file"):
         path.write_text("secret")
-    box = Sandbox([tmp_path / "data", tmp_path / "file", tmp_path / "nowhere"], [tmp_path])
+    box = Sandbox([packages / "data", packages / "file", packages / "nowhere"], [packages])
     said, _ = output_of(box, "cd /packages/0; ls data; cat file; ls")
     assert said.split() == ["a.py", "data", "file"]
 
