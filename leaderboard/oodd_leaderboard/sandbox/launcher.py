@@ -15,7 +15,7 @@ import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
@@ -218,7 +218,7 @@ def _readable() -> Iterator[Path]:
             yield from (path.absolute() for path in sorted(entry.iterdir()) if _importable(path))
     # Editable installs may find modules elsewhere, and those of plug-ins are not imported here.
     points = (p for g in ("oodd_eval", "oodd_eval.observers") for p in entry_points(group=g))
-    for name in sorted({*(name for name in sys.modules if "." not in name), *map(_top, points)}):
+    for name in sorted({n.partition(".")[0] for n in (*sys.modules, *(p.module for p in points))}):
         with suppress(ImportError, ValueError, AttributeError):
             if spec := find_spec(name):
                 for path in (*(spec.submodule_search_locations or ()), spec.origin):
@@ -231,10 +231,6 @@ def _import_path() -> list[str]:
     """Return the import path of the environment, which is a worker's: without that of variables."""
     ask = [sys.executable, "-I", "-c", r"import sys; print(*sys.path, sep='\0', end='')"]
     return subprocess.run(ask, capture_output=True, text=True, check=True).stdout.split("\0")  # noqa: S603  our own interpreter
-
-
-def _top(point: EntryPoint) -> str:
-    return point.module.partition(".")[0]
 
 
 def _importable(path: Path) -> bool:
