@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from oodd_leaderboard.sandbox.describe import discover_entry
-from oodd_leaderboard.sandbox.launcher import make_sandbox
+from oodd_leaderboard.sandbox.launcher import Sandbox
 
 from oodd_eval.data.split import load_split, split_places
 from oodd_eval.plugins.isolation.child import Limits
@@ -21,7 +21,7 @@ MEMORY = 2 * 10**9
 
 def boxed_plugins(packages, hidden=(), memory=MEMORY):
     """Return the plug-ins in a directory of packages, and the launcher of their workers."""
-    launcher = make_sandbox(hidden, [packages])
+    launcher = Sandbox(hidden, [packages])
     return discover_entry(Path(packages), launcher, memory), launcher
 
 
