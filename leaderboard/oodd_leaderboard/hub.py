@@ -16,8 +16,8 @@ from oodd_eval.errors import OutputError, UsageError
 from oodd_eval.metrics.catalogue import metric_info
 from oodd_eval.results.board import Board, boards
 from oodd_eval.results.identity import Setting
-from oodd_eval.results.standings import primary_settings
 from oodd_leaderboard.reported import SubmittedEntry
+from oodd_leaderboard.standings import primary_settings
 
 _TASK: Final = {"type": "anomaly-detection", "name": "Detection of out-of-distribution dynamics"}
 

@@ -16,10 +16,10 @@ from oodd_eval.names import counted, expression, select
 from oodd_eval.results.directory import RECORDS, ResultsDirectory
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
-from oodd_eval.results.standings import primary_settings
 from oodd_leaderboard import reported as stored
 from oodd_leaderboard.curve_file import make_curves, write_curves
 from oodd_leaderboard.reported import CURVES, ENTRY, EntryInfo
+from oodd_leaderboard.standings import primary_settings
 from oodd_leaderboard.verify import EntryVerdict, Neighbours, find_split, formats, verify_entry
 
 LARGE: Final = 10 * 10**6  # bytes of a large entry: a repository keeps every version of it

@@ -1,9 +1,10 @@
 """The tables of a board, and the sentences that stand beside them."""
 
+import functools
 import itertools
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 from oodd_eval.data.condition import NOMINAL
@@ -19,7 +20,6 @@ from oodd_eval.prose import Table
 from oodd_eval.results.board import Board, Column, Value, cells_with, grouped
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
-from oodd_eval.results.standings import RankedBoard, Standing
 
 BRIEF: Final = "\N{DAGGER}"
 """Marks the figures of brief cells."""
@@ -80,8 +80,6 @@ _SIMPLE: Final = (
 )
 """Rows that a detector with a learned model of the dynamics should beat."""
 
-_FEW: Final = 30  # test seeds per environment below which a board calls comparisons weak
-
 CLOCK: Final = "clock"  # the row that knows the phase of an episode and nothing else
 
 _WITHIN: Final = tuple(f"found_within_{k}" for k in catalogue.FOUND_WITHIN)
@@ -104,8 +102,6 @@ _ALARMS_OF_LOGS: Final = (
 ROWS: Final = tuple(name for name, info in catalogue.METRICS.items() if info.request)
 """Metrics of published tables, which rank nothing."""
 
-_LABELS: Final = ("rank", "detector", "settings")
-
 
 @dataclass(frozen=True)
 class Tables:
@@ -117,8 +113,9 @@ class Tables:
         The board.
     intervals
         Whether means have their 95 % intervals; false episodes always have.
-    standings
-        Where there are some, rows are in their order and have their places.
+    labels, label_names
+        What stands before each row's figures, and the headings of that; by default its name. The
+        rows have this order, by default the best mean first.
     level
         Suffix of the level of guaranteed alarms, by default the board's, or the strictest that
         its records have.
@@ -126,7 +123,8 @@ class Tables:
 
     board: Board
     intervals: bool = False
-    standings: Sequence[Standing] = ()
+    labels: Mapping[Setting, Sequence[str]] = field(default_factory=dict)
+    label_names: Sequence[str] = ("detector",)
     level: str = ""
 
     def separability(self) -> Table:
@@ -141,7 +139,7 @@ class Tables:
         columns += [Column(board.ranking, name, [name]) for name in board.environments]
         title = "Separability: matched AUC (%), higher is better. The leaderboard ranks by this."
         note = _joined(explained(beside), unranked(board))
-        return self.table(title, self._with_ends(columns), note, best_first(board))
+        return self.table(title, self._with_ends(columns), note)
 
     def guaranteed(self, *, nulls: bool = False) -> Table | None:
         """Return guaranteed alarms at a level, mean over cells; None when no record has them.
@@ -184,12 +182,9 @@ class Tables:
         if not records:
             return None
         explaining = {r.setting for r in records}
-        ranks = [standing for standing in self.standings if standing.entry in explaining]
-        kept = [r for r in self.board.records if r.setting in explaining]
-        of_rows = replace(self, board=self.board if ranks else Board(kept), standings=ranks)
-        columns, level = of_rows.columns(catalogue.ATTRIBUTION), metric_info(min(names)).level
+        columns, level = self.columns(catalogue.ATTRIBUTION), metric_info(min(names)).level
         title = f"Attribution at {level} (onset error in rows, the rest in %)"
-        return of_rows.table(title, columns, _ATTRIBUTION)
+        return self.table(title, columns, _ATTRIBUTION, [e for e in self.order if e in explaining])
 
     def all_metrics(self) -> Table:
         """Return every metric without an alarm, mean over all cells, with nulls and the placebo."""
@@ -309,7 +304,7 @@ class Tables:
             return None
         by = " and ".join(["environment"] * bool(places) + ["group"] * bool(board.groups))
         title = metric_info(metric).title
-        entries = self._entries
+        entries = self.order
         table = self.table(f"{title[0].upper()}{title[1:]} (%) by {by}", columns, "", entries)
         if places:
             means = [show_value(_mean(board, entry, places), metric) for entry in entries]
@@ -332,11 +327,12 @@ class Tables:
         asked = self.level or catalogue.HEADLINE
         if f"false_episodes_{asked}" not in [c.metric for c in columns]:
             note = _joined(note, *lowered_level(self.board, asked, suffix))
-        return self.table(title, self._with_ends(columns), note, self._entries)
+        return self.table(title, self._with_ends(columns), note)
 
-    @property
-    def _entries(self) -> list[Setting]:
-        return [row.entry for row in self.standings] or best_first(self.board)
+    @functools.cached_property
+    def order(self) -> list[Setting]:
+        """The rows, those with labels in the order of these, otherwise the best mean first."""
+        return [*self.labels] or best_first(self.board)
 
     def _at_level(self, *names: str) -> list[str]:
         return [f"{name}_{self.level or self.board.level}" for name in names]
@@ -360,14 +356,12 @@ class Tables:
     def table(
         self, title: str, columns: Sequence[Column], note: str = "", entries: Sequence[Setting] = ()
     ) -> Table:
-        """Return columns with a row per detector, or per standing with its place."""
-        labels = {row.entry: _labels(row) for row in self.standings}
-        labels = labels or {e: [str(e)] for e in entries or self.board.entries}
-        rows = [[*label, *texts(self.board, entry, columns)] for entry, label in labels.items()]
-        first = _LABELS if self.standings else ("detector",)
-        header = [*first, *(c.title for c in columns)]
-        note = _joined(note, *reasons(self.board, labels, columns))
-        return Table(title, header, rows, len(first), note, wrap=not self.board.paired)
+        """Return columns with a row per detector, by default all in the order of the tables."""
+        rows = entries or self.order
+        cells = [[*self.labels.get(e, [str(e)]), *texts(self.board, e, columns)] for e in rows]
+        header = [*self.label_names, *(c.title for c in columns)]
+        note = _joined(note, *reasons(self.board, rows, columns))
+        return Table(title, header, cells, len(self.label_names), note, wrap=not self.board.paired)
 
 
 _BESIDE_MATCHED: Final = ("auc_smoothed", "auc_unpaired")
@@ -391,9 +385,18 @@ def by_group(board: Board, title: str) -> list[Column]:
 
 
 def best_first(board: Board) -> list[Setting]:
-    """Return the rows of a board by their mean of the metric that ranks them, the best first."""
-    means = {entry: board.of(entry, Column(board.ranking)).value for entry in board.entries}
-    return sorted(means, key=lambda e: math.inf if math.isnan(means[e]) else -means[e])
+    """Return the rows of a board by their mean of the metric that ranks them, the best first.
+
+    Rows without a value in some expected cell come last.
+    """
+    means = {entry: board.of(entry, Column(board.ranking)) for entry in board.entries}
+
+    def order(entry: Setting) -> tuple[bool, float, str]:
+        mean = means[entry]
+        undefined = math.isnan(mean.value)
+        return undefined or mean.partial, 0.0 if undefined else -mean.value, str(entry)
+
+    return sorted(means, key=order)
 
 
 def _mean(board: Board, entry: Setting, columns: Sequence[Column]) -> Value:
@@ -453,50 +456,6 @@ def failures(board: Board) -> Table | None:
     rows = [[r.environment, r.cell.label, r.status, r.reason] for r in board.failures()]
     header = ["environment", "detector", "state", "reason"]
     return Table("Failures", header, rows, labels=4) if rows else None
-
-
-def ranking(ranks: RankedBoard) -> Table:
-    """Return ranks by separability, with what a reader needs to judge them."""
-    board = ranks.board
-    title = metric_info(board.ranking).title
-    columns = [c._replace(intervals=True) for c in by_group(board, title)]
-    names = [n for n in _BESIDE[board.paired] if n != board.ranking]
-    names = names if board.paired else board.present(names)
-    columns += [Column(name, metric_info(name).title) for name in names]
-    rows = []
-    for row in ranks.standings:
-        rank, detector, settings = _labels(row)
-        inputs = row.inputs.replace("observations+actions", "+actions") or UNDEFINED
-        labels = [rank, row.ties or UNDEFINED, printed_rank(row.alarm_rank), detector, settings]
-        means = texts(board, row.entry, columns)
-        rows.append([*labels, inputs, *means, _percent(row.wins), row.lead or UNDEFINED])
-    labels = ["rank", "ties", "alarm rank", "detector", "settings", "inputs"]
-    header = [*labels, *(c.title for c in columns), "win rate", "lead"]
-    return Table(f"Ranking by {title} (%)", header, rows, labels=6)
-
-
-_BESIDE: Final = {
-    True: ("auc_smoothed", "auc_unpaired", "auc", "auc_placebo"),
-    False: ("auc_pool_null", "auc_rows", "auc_outcome"),
-}
-"""Columns beside the metric that ranks, of rows with twins and without."""
-
-
-def cost(ranks: RankedBoard) -> Table:
-    """Return seconds per fit, microseconds per scored step and peak memory."""
-    rows = [[*_labels(row), *map(_digits, row.cost)] for row in ranks.standings]
-    header = [*_LABELS, "fit (s)", "score (µs per step)", "peak memory (MB)"]
-    return Table("Cost", header, rows, labels=3)
-
-
-def wins(ranks: RankedBoard) -> Table | None:
-    """Return in which share of cells the row beats the column; None with fewer than two rows."""
-    labels = list(ranks.ranking.ranks)
-    rates = {pair: _percent(rate) for pair, rate in ranks.rates.items()}
-    rows = [[row, *(rates.get((row, column), "") for column in labels)] for row in labels]
-    metric = metric_info(ranks.board.ranking).title
-    title = f"Win rates: share of cells (%) in which the row's {metric} is above the column's"
-    return Table(title, ["detector", *labels], rows) if len(labels) > 1 else None
 
 
 def findings(board: Board) -> list[str]:
@@ -634,83 +593,6 @@ def _episodes(board: Board) -> list[str]:
 
 
 _PARTS: Final = {"train": "training", "calibration": "calibration", "nominal": "nominal test"}
-
-
-def ranking_notes(
-    ranks: RankedBoard, *, whole: bool = True, rows: Sequence[Standing] = ()
-) -> list[str]:
-    """Return what has to stand below a ranking.
-
-    Not `whole` is one without columns of lead and alarms and without text above it. `rows` are
-    those that are printed, by default all.
-    """
-    rows = rows or ranks.standings
-    lines = [] if whole else [_RANK]
-    lines += [f"Not ranked: {row.entry}, {row.state}." for row in rows if row.state]
-    if not all(row.primary for row in rows):
-        lines.append(
-            "A variant is a further row of a detector. It has the rank that it would have, and "
-            "pushes no other row down."
-        )
-    if any(row.training not in {"nominal", "oracle"} for row in rows):
-        lines.append("Rows trained on more than nominal trajectories of the split are not ranked.")
-    if any(row.training == "oracle" for row in rows):
-        lines.append(
-            "An oracle has the true equations of the environment. It says how far the limit is, "
-            "and is not ranked."
-        )
-    if whole and any(row.lead for row in rows):
-        lines.append(
-            "Lead: in how many of the cases in which one environment is left out the row's mean "
-            "stays above that of the next rank."
-        )
-    if ranks.alarms.ranks:
-        info = metric_info(ranks.board.alarm_ranking)
-        if whole:
-            lines.append(f"Alarm rank: the rank by {info.phrase}, {info.better} is better.")
-        without = (row for row in rows if row.alarm_state and not row.state)
-        lines += [f"Without an alarm rank: {row.entry}, {row.alarm_state}." for row in without]
-        lines += uncalibrated(ranks.board)
-    seeds = ranks.board.test_seeds()
-    if seeds and seeds[0] < _FEW and len(ranks.ranking.ranks) > 1:
-        episodes = "test seeds per environment" if ranks.board.paired else "anomalous episodes"
-        lines.append(
-            f"With {seeds[0]} {episodes} small differences stay hidden: rows that "
-            "share a letter may well differ."
-        )
-    return lines
-
-
-_RANK: Final = (
-    "Rank is 1 + the number of primary rows that are significantly better, so ranks need not "
-    "follow the means."
-)
-
-
-def printed_rank(rank: int | None) -> str:
-    """Return a rank as tables print it."""
-    return UNDEFINED if rank is None else str(rank)
-
-
-def _labels(row: Standing) -> list[str]:
-    """Return rank, detector (marked where it is trivial), and settings with the number of seeds."""
-    overrides = [f"{k}={v}" for k, v in row.entry.overrides.items()]
-    several = [f"{row.seeds} seeds"] if row.seeds > 1 else []
-    settings = ", ".join([f"Δ={row.entry.horizon}", *overrides, *several])
-    return [printed_rank(row.rank), row.entry.detector + row.marks, settings]
-
-
-def _percent(rate: float) -> str:
-    return UNDEFINED if math.isnan(rate) else f"{100 * rate:.0f}"
-
-
-def _digits(value: float) -> str:
-    """Return two significant digits, or the whole part of what is larger; at least 0.001."""
-    if math.isnan(value):
-        return UNDEFINED
-    if 0 < value < 0.001:
-        return "< 0.001"
-    return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
 
 
 def why_undefined(record: Record, metric: str) -> str:
