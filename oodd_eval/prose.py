@@ -147,8 +147,9 @@ def _fitting(table: Table, width: int) -> list[Table]:
     """Return the table, the table turned, or parts of its columns, whichever first fits."""
     candidates = [table, table.transposed()]
     if table.wrap:
-        candidates += [_wrapped(candidate, width) for candidate in candidates]
-        table = candidates[-2]
+        wrapped = [_wrapped(candidate, width) for candidate in candidates]
+        candidates = [table, wrapped[0], candidates[1], wrapped[1]]
+        table = wrapped[0]
     for candidate in candidates:
         if _width(candidate) <= width:
             return [candidate]
@@ -168,7 +169,7 @@ def _wrapped(table: Table, width: int) -> Table:
     most = max(_NARROW, width // 3)
 
     def lines(text: str, room: int) -> str:
-        wrapper = textwrap.TextWrapper(room)
+        wrapper = textwrap.TextWrapper(room, break_long_words=room >= most)
         wrapper.wordsep_re = _PARTS
         return "\n".join(wrapper.wrap(text))
 

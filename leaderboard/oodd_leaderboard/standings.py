@@ -14,7 +14,7 @@ from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 from oodd_eval.errors import ResultsError
-from oodd_eval.metrics.bootstrap import mean_over_cells, nan_mean
+from oodd_eval.metrics.bootstrap import nan_mean
 from oodd_eval.metrics.catalogue import UNDEFINED, metric_info
 from oodd_eval.metrics.ranking import Difference, Position, differences
 from oodd_eval.names import counted
@@ -204,7 +204,7 @@ def ordered(
     ranks = {e: 1 if e in band else i for i, e in enumerate(places, 1)}
     standings = []
     for row in order:
-        entry, means = _entry_of(row, entries), _seed_means(counted_records[row], metric)
+        entry, means = _entry_of(row, entries), board.seed_means(row, metric)
         standing = Standing(
             entry=row,
             records=by_row[row],
@@ -291,13 +291,6 @@ def _state(
     if undefined := sum(r.ok for r in records) - defined:
         reasons.append(f"undefined in {undefined} of {all_cells}")
     return ", ".join([*reasons, *(["a variant"] if variant else [])])
-
-
-def _seed_means(records: Iterable[Record], metric: str) -> list[float]:
-    """Return a row's mean with each of its detector seeds."""
-    by_seed = terms_of(records, metric)
-    means = (mean_over_cells((seed, c.value) for c in by_seed[seed].values()) for seed in by_seed)
-    return [mean for mean in means if not math.isnan(mean)]
 
 
 def _training(records: Iterable[Record], entry: Entry) -> Training:

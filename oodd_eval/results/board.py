@@ -15,7 +15,7 @@ from oodd_eval.data.condition import Condition, conditions_of
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, SPLITS, in_order
 from oodd_eval.data.split import published_digests
 from oodd_eval.metrics.auc import Contribution
-from oodd_eval.metrics.bootstrap import LEVEL, DrawnCells, mean_interval, mean_over_cells
+from oodd_eval.metrics.bootstrap import LEVEL, DrawnCells, mean_interval, mean_over_cells, nan_mean
 from oodd_eval.metrics.catalogue import ALARM_RANKING, HEADLINE, LEVELS, NAMES, RANKING, metric_info
 from oodd_eval.metrics.ranking import Position
 from oodd_eval.results.identity import Setting
@@ -165,9 +165,9 @@ class Board:
     ) -> Value:
         """Return an entry's mean of a metric over cells, seeds included.
 
-        The interval resamples test trajectories, the same ones for all cells of an environment,
-        and detector seeds where there are several. Cells that are not expected, see
-        `expected_cells`, count only where none of the others is.
+        The interval resamples test trajectories, the same ones for all cells of an environment;
+        detector seeds are fixed. Delays of fewer than ten finds have none. Cells that are not
+        expected, see `expected_cells`, count only where none of the others is.
         """
         return self._mean(entry, tuple(environments), tuple(anomalies), metric, intervals)
 
@@ -199,7 +199,8 @@ class Board:
         if blank.state:
             return blank
         ends = (NAN, NAN)
-        if intervals and (drawn := _drawn_cells(records, metric)):
+        drawn = _drawn_cells(records, metric) if intervals else {}
+        if drawn and not _has_few_finds(records, metric):
             ends = mean_interval([*drawn.values()], kind=metric_info(metric).interval)
         values = self._values(entry, metric)
         value = mean_over_cells((of_row[i].seed, values[i]) for i in indices)
@@ -208,6 +209,16 @@ class Board:
     def _values_of(self, entry: Setting, metric: str) -> list[float]:
         """Return a metric of all records of a row."""
         return _values_of(self._rows[entry], metric)
+
+    def seed_means(self, entry: Setting, metric: str) -> list[float]:
+        """Return an entry's mean over expected cells with each detector seed, NaN left out."""
+        values = zip(self._rows[entry], self._values(entry, metric), strict=True)
+        by_seed: dict[int, list[float]] = {}
+        for r, value in values:
+            if (r.environment, r.anomaly) in self._expected:
+                by_seed.setdefault(r.seed, []).append(value)
+        means = (nan_mean(by_seed[seed]) for seed in sorted(by_seed))
+        return [mean for mean in means if not math.isnan(mean)]
 
     def compare(self, first: Setting, second: Setting, metric: str) -> tuple[float, float, int]:
         """Return both means over the cells that both have, and the number of those cells."""
@@ -353,6 +364,18 @@ def _drawn_cells(records: Sequence[Record], metric: str) -> dict[tuple[int, ...]
             environment, seeds, *both, _is_median(metric), nominal, condition, deviations
         )
     return cells
+
+
+def _has_few_finds(records: Sequence[Record], metric: str) -> bool:
+    """Tell whether a metric is the delay of too few found episodes for an interval."""
+    if metric.partition("_at_")[0] not in ("delay", "delay_null"):
+        return False
+    terms = [r.per_trajectory[metric] for r in records if metric in r.per_trajectory]
+    finds = sum(np.count_nonzero(denominators) for _, denominators in terms)
+    return finds < _FEWEST_FINDS * len({r.seed for r in records})
+
+
+_FEWEST_FINDS: Final = 10  # a seed, below which a mean delay of found episodes has no interval
 
 
 def _values_of(records: Sequence[Record], metric: str) -> list[float]:

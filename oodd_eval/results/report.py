@@ -35,8 +35,9 @@ class Report:
     intervals
         Whether means have their 95 % intervals.
     detail
-        ``"brief"`` is what a run prints at its end; ``"wide"`` adds all metrics and levels of
-        alarms; ``"full"`` also each row's cells and all failures.
+        ``"brief"`` is what a run prints at its end: the headline. ``"wide"`` adds means by
+        environment and group, by detector seed, and all metrics and levels of alarms; ``"full"``
+        also each row's cells and all failures.
     detector
         Name of a detector, for its cells alone.
     metric
@@ -68,7 +69,7 @@ class Report:
     def sections(self) -> list[Section]:
         """The sections, made when a renderer asks for them."""
         make = self._of_detector if self.detector else self._of_board
-        return [make(board) for board in boards(self.records)]
+        return [make(_in_order(board)) for board in boards(self.records)]
 
     def _of_board(self, board: Board) -> Section:
         ok = sum(r.ok for r in board.records)
@@ -88,16 +89,20 @@ class Report:
         )
 
     def _tables(self, board: Board) -> Iterator[Table | None]:
-        means, full = Tables(board, self.intervals, level=self.level), self.detail == "full"
+        means = Tables(board, self.intervals, level=self.level)
+        full, brief = self.detail == "full", self.detail == "brief"
         ranked = not board.leaves_out([board.ranking])
+        strengths = StrengthTables(board, self.intervals, self.units)
         if not board.paired:
-            yield from means.of_logs(whole=self.detail != "brief")
+            yield from means.of_logs(whole=not brief)
         else:
-            yield means.separability() if ranked else None
-            yield means.guaranteed()
-        yield means.attribution()
-        yield from StrengthTables(board, self.intervals, self.units).overview(places=full)
-        if self.detail != "brief":
+            yield means.headline()
+        yield from strengths.overview(places=full, whole=not brief)
+        if not brief:
+            yield means.separability() if board.paired and ranked else None
+            yield means.guaranteed() if board.paired else None
+            yield means.seeds()
+            yield means.attribution()
             yield None if board.leaves_out(_WITHOUT_ALARM) else means.all_metrics()
             yield from means.all_alarms()
         if board.paired and (full or self.paper):
@@ -130,6 +135,12 @@ class Report:
             if by_row.get(entry):
                 of_board = StrengthTables(board, self.intervals, self.units)
                 yield of_board.by_place(entry, by_row[entry])
+
+
+def _in_order(board: Board) -> Board:
+    """Return a board whose rows have the order of all its tables, the best mean first."""
+    by_row = grouped(board.records, lambda r: r.setting)
+    return Board([r for row in tables.best_first(board) for r in by_row[row]])
 
 
 def findings_of(board: Board, level: str = "") -> list[str]:

@@ -23,7 +23,7 @@ from oodd_eval.prose import Table
 from oodd_eval.results.board import Board, Column
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
-from oodd_eval.results.tables import show_value, unranked
+from oodd_eval.results.tables import best_first, show_value, unranked
 
 DETECTION: Final = f"found_within_{FOUND_WITHIN[-1]}_{HEADLINE}"
 """The metric whose share decides: found within 100 rows, where 5 % of nominal episodes alarm."""
@@ -303,21 +303,21 @@ class StrengthTables:
         """The thresholds of the records."""
         return thresholds(self.board.records)
 
-    def overview(self, *, places: bool = False) -> list[Table]:
-        """Return all tables; none without records at strengths.
+    def overview(self, *, places: bool = False, whole: bool = True) -> list[Table]:
+        """Return all tables, or not `whole` the first one; none without records at strengths.
 
         With `places`, each row has a table with its threshold in every environment.
         """
-        board, by_row = self.board, self.by_row
+        board, by_row, rows = self.board, self.by_row, best_first(self.board)
         if not board.paired:  # episodes of two strengths have nothing in common
-            return [self.separability(board.entries)] if self.strengths.names else []
+            return [self.separability(rows)] if self.strengths.names else []
         ranked = by_row and not board.leaves_out([board.ranking])
-        order = [entry for entry in board.entries if entry in by_row]
+        order = [entry for entry in rows if entry in by_row]
         tables = [self.separability(order)] if ranked else []
         if any(by_row.values()):  # else no level of 5 %, with few calibration episodes
             single = [self.by_place(e, by_row[e]) for e in order if places and by_row[e]]
-            tables = [self.relative(), *tables, self.by_kind(order), *single]
-        return tables
+            tables = [self.relative(order), *tables, self.by_kind(order), *single]
+        return tables if whole else tables[:1]
 
     def by_place(self, entry: Setting, by_pair: Mapping[Pair, DetectionThreshold]) -> Table:
         """Return one row's thresholds by environment and kind of anomaly, in the anomaly's unit."""
@@ -337,11 +337,10 @@ class StrengthTables:
         note = f"{_RULE} ≤ and > mark thresholds beyond the weakest and the strongest rung."
         return Table(title, ["Environment", *map(self._with_unit, kinds)], rows, note=note)
 
-    def relative(self) -> Table:
-        """Return relative thresholds and shares found by strength, the lowest threshold first."""
+    def relative(self, order: Sequence[Setting]) -> Table:
+        """Return relative thresholds and shares found by strength."""
         strengths, reference = self.strengths, self.by_row.get(REFERENCE, {})
         means = {e: _mean(by_pair, reference, strengths) for e, by_pair in self.by_row.items()}
-        order = sorted(means, key=lambda e: mean.value if (mean := means[e]) else math.inf)
         most = max((mean.pairs for mean in means.values() if mean), default=0)
         shares = self._by_strength(order, DETECTION)
         rows = []

@@ -94,6 +94,12 @@ _PAPERS_NULLS: Final = ("delay_null", "far_twin")
 POOLED: Final = ("auc_pool", "auc_pool_null", "auc_rows")
 """Metrics of rows that are known to be anomalous, in the order of the headline's columns."""
 
+OUTCOME: Final = "auc_outcome"
+"""Metric of episodes that are known by their outcome alone."""
+
+WORST: Final = "worst environment"
+"""Heading of the column that has the environment in which a row is worst."""
+
 _ALARMS_OF_LOGS: Final = (
     *("events_found", "delay_censored", _WITHIN[-1], "missed"),
     *("false_episodes", "early", "false_alarms_per_hour"),
@@ -127,8 +133,74 @@ class Tables:
     label_names: Sequence[str] = ("detector",)
     level: str = ""
 
+    def headline(self) -> Table | None:
+        """Return the columns that stand first everywhere, a row per detector.
+
+        They are the metric that ranks with its interval, the worst environment (with one
+        environment a column an anomaly), and found, missed and false episodes of guaranteed alarms.
+        None when no record has any of them.
+        """
+        board, metric = self.board, self.board.ranking
+        first = (
+            [Column(metric, _heading(metric), intervals=True)] if self._present([metric]) else []
+        )
+        environments = [e for e in board.environments if self._present([metric], [e])]
+        if first and len(environments) == 1:
+            kinds = [kind for kind in board.anomalies if cells_with(metric, self._of(kind))]
+            first += [Column(metric, kind, anomalies=[kind]) for kind in kinds[: len(TABLE1)]]
+            first = first[:1] if len(kinds) == 1 else first
+        outcomes = metric == OUTCOME
+        alarms = self.columns(self._at_level(*(_OUTCOMES if outcomes else _FIRST)))
+        if not first and not alarms:
+            return None
+        info = metric_info(metric)
+        titles = [f"{info.title[0].upper()}{info.title[1:]}"] * bool(first)
+        titles += [f"guaranteed alarms at {percent_of(self.suffix)}"] * bool(alarms)
+        note = _joined(self._promise(alarms), _SAME_ROW * outcomes, unranked(board))
+        table = self.table(f"{' and '.join(titles)} (%)", [*first, *alarms], note)
+        if len(environments) > 1:
+            worst = [self._worst(entry, environments) for entry in self.order]
+            for row, text in zip((table.header, *table.rows), (WORST, *worst), strict=True):
+                row.insert(table.labels + 1, text)
+        return replace(table, wrap=True)
+
+    def _of(self, anomaly: str) -> list[Record]:
+        return [r for r in self.board.records if r.anomaly == anomaly]
+
+    def _worst(self, entry: Setting, environments: Sequence[str]) -> str:
+        """Return the environment in which a row's mean is lowest, and that mean."""
+        means = [
+            (e, self.board.of(entry, Column(self.board.ranking, "", [e]))) for e in environments
+        ]
+        defined = [(e, mean) for e, mean in means if not math.isnan(mean.value)]
+        if not defined:
+            return ""
+        environment, mean = min(defined, key=lambda pair: pair[1].value)
+        return f"{environment} {show_value(mean, self.board.ranking)}"
+
+    def _promise(self, columns: Iterable[Column]) -> str:
+        """Return what a table of guaranteed alarms promises, and which level stands for another."""
+        names, asked = [column.metric for column in columns], self.level or catalogue.HEADLINE
+        episodes = "nominal twins" if self.board.paired else "nominal test episodes"
+        promise = (
+            f"The threshold promises an alarm in at most {percent_of(self.suffix)} of nominal "
+            f"episodes; false episodes is the share of this split's {episodes} that raised one."
+        )
+        lowered = lowered_level(self.board, asked, self.suffix)
+        return _joined(
+            promise * bool(names), *(lowered if f"false_episodes_{asked}" not in names else ())
+        )
+
+    @functools.cached_property
+    def suffix(self) -> str:
+        """The level of guaranteed alarms: the one asked for, the board's, or the strictest."""
+        levels = self.board.present(f"false_episodes_{level}" for level in catalogue.LEVELS)
+        usual = f"false_episodes_{self.board.level}"
+        strictest = usual if usual in levels or not levels else levels[-1]
+        return self.level or strictest.removeprefix("false_episodes_")
+
     def separability(self) -> Table:
-        """Return matched AUC by anomaly group and by environment, the best mean first.
+        """Return matched AUC by anomaly group and by environment.
 
         Beside the mean over all cells stand that of smoothed scores and that against another twin,
         where records have them.
@@ -146,11 +218,7 @@ class Tables:
 
         With `nulls` each figure stands beside what false alarms alone give.
         """
-        levels = self.board.present(f"false_episodes_{level}" for level in catalogue.LEVELS)
-        usual = f"false_episodes_{catalogue.HEADLINE}"
-        strictest = usual if usual in levels or not levels else levels[-1]
-        asked = self.level or catalogue.HEADLINE
-        suffix = self.level or strictest.removeprefix("false_episodes_")
+        suffix = self.suffix
         bases = catalogue.GUARANTEED if nulls else _ALARMS
         columns = self.columns(f"{name}_{suffix}" for name in bases)
         if not columns:
@@ -160,14 +228,22 @@ class Tables:
         hourly = f"{metric_info(hours).noun}, " * (hours in names)
         steps = "delays in steps, " * any(name.startswith("delay") for name in names)
         units = f"{steps}{hourly}the rest in %" if steps or hourly else "%"
-        episodes = "nominal twins" if self.board.paired else "nominal test episodes"
-        note = _joined(
-            f"The threshold promises an alarm in at most {percent_of(suffix)} of nominal episodes; "
-            f"false episodes is the share of this split's {episodes} that raised one.",
-            CENSORED * (f"delay_censored_{suffix}" in names),
-            *(lowered_level(self.board, asked, suffix) if asked != suffix else ()),
-        )
+        note = _joined(self._promise(columns), CENSORED * (f"delay_censored_{suffix}" in names))
         return self.table(f"Guaranteed alarms at {percent_of(suffix)} ({units})", columns, note)
+
+    def seeds(self) -> Table | None:
+        """Return the means of the lowest and the highest detector seed; None with one seed each."""
+        board, metric = self.board, self.board.ranking
+        means = {entry: board.seed_means(entry, metric) for entry in self.order}
+        info = metric_info(metric)
+        rows = [
+            [*self.labels.get(e, [str(e)]), str(len(m)), *map(info.text, (min(m), max(m)))]
+            for e, m in means.items()
+            if len(m) > 1
+        ]
+        header = [*self.label_names, "seeds", "lowest", "highest"]
+        title = f"{info.title[0].upper()}{info.title[1:]} by detector seed (%)"
+        return Table(title, header, rows, len(self.label_names), _FIXED) if rows else None
 
     def papers(self) -> Table:
         """Return what the paper's alarm does, mean over cells, under a heading of its own."""
@@ -210,7 +286,7 @@ class Tables:
     def _anomaly_group(self, horizon: int, group: str) -> Table:
         """Return one of them; AVG is over detectors, without trivial rows if there are others."""
         board = self.board
-        entries = [e for e in board.entries if e.horizon == horizon]
+        entries = [e for e in self.order if e.horizon == horizon]
         averaged = [e for e in entries if not board.is_trivial(e)] or entries
         rows = []
         for environment, metric in itertools.product(board.environments, _TABLE_5):
@@ -247,17 +323,25 @@ class Tables:
     def of_logs(self, *, whole: bool = False) -> list[Table]:
         """Return the tables of a board without twins, the most important one first.
 
-        With `whole` each of several environments has a headline of its own, too.
+        With `whole` there is more than the headline, and each of several environments has a table
+        of its own.
         """
         environments = self.board.environments
-        single = environments if whole and len(environments) > 1 else []
-        candidates = [self._headline(), self._outcomes(), self._nominal(), self._apart()]
-        candidates += [self._headline([name]) for name in single]
+        ranks = bool(self._present([self.board.ranking]))
+        candidates = [self.headline() if ranks else None]
+        if whole:
+            single = environments if len(environments) > 1 else []
+            candidates += [self._alarms(), self._outcomes(), self._nominal(), self._apart()]
+            candidates += [self._alarms([name]) for name in single]
+        elif not ranks:
+            candidates.append(self._nominal())
+        elif self.board.ranking != OUTCOME:
+            candidates.append(self._outcomes())
         if self._present(ROWS):
             candidates.append(self._of_logs(_PUBLISHED, ROWS))
         return [table for table in candidates if table]
 
-    def _headline(self, environments: Sequence[str] = ()) -> Table | None:
+    def _alarms(self, environments: Sequence[str] = ()) -> Table | None:
         """Return separability and guaranteed alarms side by side; None without anomalous rows."""
         alarms = self._at_level(*_ALARMS_OF_LOGS)
         if not self._present((POOLED[-1], alarms[0]), environments):
@@ -272,12 +356,12 @@ class Tables:
 
     def _outcomes(self) -> Table | None:
         """Return what is found of episodes known by their outcome alone; None without any."""
-        if not self._present(["auc_outcome"]):
+        if not self._present([OUTCOME]):
             return None
-        names = ["auc_outcome", *self._at_level("found_outcome", "found_outcome_null")]
-        if self._headline() is None:
+        names = [OUTCOME, *self._at_level("found_outcome", "found_outcome_null")]
+        if self._alarms() is None:
             names += [*POOLED, *self._at_level(*_NOMINAL)]
-        note = "Episodes are compared up to the same row, as failures run into the time limit."
+        note = _SAME_ROW
         if all(entry.detector != CLOCK for entry in self.board.entries):
             note += (
                 f" Add the row {CLOCK} (--detector ...,{CLOCK}) to see how much of this the phase "
@@ -287,7 +371,7 @@ class Tables:
 
     def _nominal(self) -> Table | None:
         """Return alarms in the environments that have nominal test episodes alone; else None."""
-        names, judged = self._at_level(*_NOMINAL), (*POOLED, "auc_outcome")
+        names, judged = self._at_level(*_NOMINAL), (*POOLED, OUTCOME)
         alone = [e for e in self.board.environments if not self._present(judged, [e])]
         if not alone or not self._present(names, alone):
             return None
@@ -317,7 +401,7 @@ class Tables:
         self, title: str, names: Iterable[str], environments: Sequence[str] = (), note: str = ""
     ) -> Table:
         """Return means of the metrics that the board has."""
-        suffix, columns = self.level or self.board.level, []
+        suffix, columns = self.suffix, []
         for info in map(metric_info, self._present(names, environments)):
             text = _heading(info.name) + " (steps)" * (info.unit == "steps")
             text += f" (≤ {percent_of(suffix)})" * info.name.startswith("false_episodes")
@@ -335,7 +419,7 @@ class Tables:
         return [*self.labels] or best_first(self.board)
 
     def _at_level(self, *names: str) -> list[str]:
-        return [f"{name}_{self.level or self.board.level}" for name in names]
+        return [f"{name}_{self.suffix}" for name in names]
 
     def _present(self, names: Iterable[str], environments: Sequence[str] = ()) -> list[str]:
         """Return the metrics that any record has a value of, of some environments or of all."""
@@ -366,6 +450,13 @@ class Tables:
 
 _BESIDE_MATCHED: Final = ("auc_smoothed", "auc_unpaired")
 _TABLE_5: Final = ("auc", "delay", "far")
+_FIRST: Final = (f"found_within_{catalogue.FOUND_WITHIN[0]}", "missed", "false_episodes")
+_OUTCOMES: Final = ("found_outcome", "false_episodes")
+_SAME_ROW: Final = "Episodes are compared up to the same row, as failures run into the time limit."
+_FIXED: Final = (
+    "Detector seeds are fixed: intervals are over test episodes and calibration episodes, and say "
+    "nothing of further seeds."
+)
 _NOMINAL: Final = ("false_episodes", "false_alarms_per_hour")
 _PUBLISHED: Final = "Metrics of rows, for comparison with published tables; they rank nothing"
 _ATTRIBUTION: Final = (
@@ -387,9 +478,12 @@ def by_group(board: Board, title: str) -> list[Column]:
 def best_first(board: Board) -> list[Setting]:
     """Return the rows of a board by their mean of the metric that ranks them, the best first.
 
-    Rows without a value in some expected cell come last.
+    Where no record has it, as in some graded suites, the share that is found decides. Rows without
+    a value in some expected cell come last.
     """
-    means = {entry: board.of(entry, Column(board.ranking)) for entry in board.entries}
+    found = f"found_within_{catalogue.FOUND_WITHIN[-1]}_{board.level}"
+    metric = found if board.leaves_out([board.ranking]) else board.ranking
+    means = {entry: board.of(entry, Column(metric)) for entry in board.entries}
 
     def order(entry: Setting) -> tuple[bool, float, str]:
         mean = means[entry]
@@ -459,25 +553,26 @@ def failures(board: Board) -> Table | None:
 
 
 def findings(board: Board) -> list[str]:
-    """Return a sentence where a simple row has a higher mean than a detector: matched AUC or AUC.
+    """Return a sentence where a simple row has a higher mean than detectors: matched AUC or AUC.
 
     The AUC of what knows the time alone is left out: the clock's is 1 by construction.
     Without twins it is the metric that ranks.
     """
     sentences = []
-    for entry, simple in itertools.product(board.entries, board.entries):
-        same_kind = board.is_trivial(entry) or simple.detector == entry.detector
-        if simple.detector not in _SIMPLE or simple.horizon != entry.horizon or same_kind:
-            continue
-        names = [board.ranking]
-        names += ["auc"] * (board.paired and simple.detector not in BLIND)
-        for info in map(metric_info, names):
-            value, lower, cells = board.compare(simple, entry, info.name)
-            if value > lower:
-                sentences.append(
-                    f"{simple} has a higher mean {info.title} than {entry}: {info.text(value)} "
-                    f"against {info.text(lower)} over {counted(cells, 'cell(s)')}."
-                )
+    for simple in (e for e in board.entries if e.detector in _SIMPLE):
+        metrics = [board.ranking]
+        metrics += ["auc"] * (board.paired and simple.detector not in BLIND)
+        for info in map(metric_info, metrics):
+            below = []
+            for entry in board.entries:
+                same_kind = board.is_trivial(entry) or simple.detector == entry.detector
+                if simple.horizon == entry.horizon and not same_kind:
+                    value, lower, _ = board.compare(simple, entry, info.name)
+                    if value > lower:
+                        below.append(f"{entry} ({info.text(lower)} against {info.text(value)})")
+            if below:
+                than = _listed(below, "rows")
+                sentences.append(f"{simple} has a higher mean {info.title} than {than}.")
     return sentences
 
 
