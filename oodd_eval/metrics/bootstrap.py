@@ -1,4 +1,4 @@
-"""Intervals from one bootstrap over test trajectories and detector seeds, paired where shared.
+"""Intervals from one bootstrap over test trajectories, paired where shared.
 
 One weight matrix says how often each test trajectory is drawn in each resample. All anomalies and
 detectors of an environment use the same one, so that differences between them are paired. Sums are
@@ -291,7 +291,7 @@ def _of_test_seeds(
     value: float,
     sizes: Mapping[tuple[str, str], int],
 ) -> tuple[float, float]:
-    """Return the interval that the choice of test trajectories and detector seeds gives."""
+    """Return the interval that the choice of test trajectories gives."""
     if kind == "exact":
         low, high = _exact(cells)
         # The mean over cells and the share of all twins differ where environments do in size.
@@ -472,6 +472,8 @@ def mean_over_cells(values: Iterable[tuple[int, float]]) -> float:
 
 def mean_samples(parts: Sequence[Samples]) -> Samples:
     """Return the mean of several numbers in every resample, over those that are defined there."""
+    if len(parts) == 1:
+        return parts[0]
     stacked = np.array(parts)
     total: Samples = stacked.sum(axis=0)
     if not np.isnan(total).any():
@@ -482,40 +484,17 @@ def mean_samples(parts: Sequence[Samples]) -> Samples:
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
-def mean_over_seeds(parts: Sequence[Samples], *, key: str = "") -> Samples:
-    """Return the mean over detector seeds, which are drawn with replacement in every resample.
-
-    The draws depend on nothing but the number of seeds and `key`, so that differences of two means
-    over the same seeds are paired. An environment as key gives each environment its own draws.
-    """
-    if len(parts) == 1:
-        return parts[0]
-    stacked = np.array(parts)  # (seeds, R)
-    drawn = drawn_seeds(*stacked.shape, key=key)
-    mean: Samples = stacked[drawn, np.arange(stacked.shape[1])].mean(axis=0)
-    return mean
-
-
-@functools.lru_cache(maxsize=64)
-def drawn_seeds(seeds: int, resamples: int, *, key: str = "") -> NDArray[np.int64]:
-    """Return which of so many detector seeds each resample draws: shape (seeds, resamples)."""
-    rng = np.random.default_rng([zlib.crc32(key.encode()), seeds] if key else 0)
-    drawn = rng.integers(seeds, size=(seeds, resamples))
-    drawn.setflags(write=False)
-    return drawn
-
-
 def sample_cells(cells: Sequence[DrawnCells]) -> Samples:
     """Return the resamples of a mean over at least one cell; a seed's mean is over its own cells.
 
-    Test trajectories are resampled, the same ones in all cells of an environment, and detector
-    seeds where there are several. Differences, sums and `mean_samples` of what this returns for
-    several detectors or anomalies are paired.
+    Test trajectories are resampled, the same ones in all cells of an environment; detector seeds
+    are fixed. Differences, sums and `mean_samples` of what this returns for several detectors or
+    anomalies are paired.
     """
     by_seed: dict[int, list[CellSum]] = {}
     for cell_sum in itertools.chain.from_iterable(c.sums for c in cells):
         by_seed.setdefault(cell_sum.seed, []).append(cell_sum)
-    return mean_over_seeds([_mean_of(by_seed[seed]) for seed in sorted(by_seed)])
+    return mean_samples([_mean_of(by_seed[seed]) for seed in sorted(by_seed)])
 
 
 def _mean_of(sums: Sequence[CellSum]) -> Samples:

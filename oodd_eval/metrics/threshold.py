@@ -6,8 +6,8 @@ half is read off between rungs, in the logarithm of the strength. Where the weak
 often enough already, or the strongest is not, the threshold is *censored*: known to lie below or
 above the ladder.
 
-Resamples draw test episodes and detector seeds as `metrics.bootstrap` does, so that thresholds of
-several detectors are paired.
+Resamples draw test episodes as `metrics.bootstrap` does, so that thresholds of several detectors
+are paired; detector seeds are fixed.
 """
 
 import math
@@ -18,7 +18,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.metrics.bootstrap import LEVEL, drawn_seeds, shared_weights
+from oodd_eval.metrics.bootstrap import LEVEL, shared_weights
 
 Floats = NDArray[np.float64]
 
@@ -193,13 +193,10 @@ def geometric_mean(
 
 def _drawn(environment: str, terms: Floats) -> Floats:
     """Return sums of terms (seeds, K, n) over all, then over each resample: (K, 1 + R)."""
-    # The terms are 0 and 1, so that their sums are exact in any order.
-    seeds, rungs, n = terms.shape
-    weights = shared_weights(environment, n)
-    by_seed = (terms.reshape(-1, n) @ weights.T).reshape(seeds, rungs, -1)
-    seed_indices = drawn_seeds(seeds, len(weights))
-    drawn = np.take_along_axis(by_seed, seed_indices[:, None], axis=0).sum(axis=0)
-    return np.concatenate([terms.sum(axis=(0, 2))[:, None], drawn], axis=1)
+    # The terms are 0 and 1, so that their sums are exact in any order. Detector seeds are fixed.
+    total = terms.sum(axis=0)
+    weights = shared_weights(environment, total.shape[1])
+    return np.concatenate([total.sum(axis=1)[:, None], total @ weights.T], axis=1)
 
 
 def _ends(logs: Floats) -> tuple[float, float]:

@@ -395,8 +395,8 @@ def standard_error(records: Iterable[Record], metric: str) -> float:
     """Return the standard error of a row's mean of a metric over the cells of one environment.
 
     It is a quarter of the width of the mean's 95 % interval, more exactly the width in units of
-    that of a normal distribution: test episodes, detector seeds and, for metrics of alarms,
-    calibration episodes are in it, and a share that is 0 or 1 everywhere is not taken to be exact.
+    that of a normal distribution: test episodes and, for metrics of alarms, calibration episodes
+    are in it, and a share that is 0 or 1 everywhere is not taken to be exact.
 
     Parameters
     ----------

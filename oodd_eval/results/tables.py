@@ -156,7 +156,9 @@ class Tables:
         info = metric_info(metric)
         titles = [f"{info.title[0].upper()}{info.title[1:]}"] * bool(first)
         titles += [f"guaranteed alarms at {percent_of(self.suffix)}"] * bool(alarms)
-        note = _joined(self._promise(alarms), _SAME_ROW * outcomes, unranked(board))
+        note = _joined(
+            self._promise(alarms), self._outcome_note() if outcomes else "", unranked(board)
+        )
         table = self.table(f"{' and '.join(titles)} (%)", [*first, *alarms], note)
         if len(environments) > 1:
             worst = [self._worst(entry, environments) for entry in self.order]
@@ -361,13 +363,17 @@ class Tables:
         names = [OUTCOME, *self._at_level("found_outcome", "found_outcome_null")]
         if self._alarms() is None:
             names += [*POOLED, *self._at_level(*_NOMINAL)]
-        note = _SAME_ROW
-        if all(entry.detector != CLOCK for entry in self.board.entries):
-            note += (
-                f" Add the row {CLOCK} (--detector ...,{CLOCK}) to see how much of this the phase "
-                "of the episode alone gives."
-            )
+        note = self._outcome_note()
         return self._of_logs("Episodes known by their outcome alone (%)", names, note=note)
+
+    def _outcome_note(self) -> str:
+        """Return what the AUC of outcomes compares, and how to see what the time alone gives."""
+        if any(entry.detector == CLOCK for entry in self.board.entries):
+            return _SAME_ROW
+        return (
+            f"{_SAME_ROW} Add the row {CLOCK} (--detector ...,{CLOCK}) to see how much of this the "
+            "phase of the episode alone gives."
+        )
 
     def _nominal(self) -> Table | None:
         """Return alarms in the environments that have nominal test episodes alone; else None."""

@@ -1,8 +1,8 @@
 """Numbers with intervals: means of metrics over cells, and paired differences of such means.
 
 Every number is a weighted sum of means, such as RIQN's AUC minus NPN's. Its interval resamples test
-trajectories, the same for all cells of an environment, and detector seeds, the same for all sides
-of a difference. Numbers are computed as arrays of the value and then its resamples.
+trajectories, the same for all cells of an environment; detector seeds are fixed. Numbers are
+computed as arrays of the value and then its resamples.
 """
 
 import functools
@@ -154,10 +154,9 @@ class Estimator:
     ) -> Samples:
         total = np.zeros(1 + RESAMPLES)
         for side, setting in ((one, setting) for one in sides for setting in one.settings):
-            means = [self._mean(setting, environment, side.anomalies, metric, s) for s in seeds]
-            value = mean_samples([one[:1] for one in means])
-            resampled = bootstrap.mean_over_seeds([one[1:] for one in means], key=environment)
-            mean = np.concatenate([value, resampled])
+            mean = mean_samples(
+                [self._mean(setting, environment, side.anomalies, metric, s) for s in seeds]
+            )
             total = total + side.weight / len(side.settings) * mean
         return total
 

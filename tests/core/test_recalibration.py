@@ -19,7 +19,7 @@ from oodd_eval.metrics.alarms import (
 from oodd_eval.metrics.auc import AlarmRule, Contribution, alarm_contributions, mean_of
 from oodd_eval.metrics.bootstrap import calibration_draws, drawn_cell, mean_interval
 from oodd_eval.metrics.cusum import Standardization
-from oodd_eval.metrics.ranking import leads, rank
+from oodd_eval.metrics.ranking import differences
 from oodd_eval.metrics.recalibration import DRAWS, PairedScores, Recalibration, drawn, thresholds
 from oodd_eval.metrics.unpaired import UnpairedScores, unpaired_alarms
 from oodd_eval.results.board import standard_error
@@ -185,7 +185,7 @@ def contributions(values, deviations):
     return {0: {("arm", "slip"): replace(mean_of(values), deviations=np.asarray(deviations))}}
 
 
-def test_calibration_noise_of_both_rows_decides_a_rank_and_common_noise_does_not():
+def test_calibration_noise_of_both_rows_decides_a_verdict_and_common_noise_does_not():
     rng = np.random.default_rng(0)
     values, noise = rng.normal(size=30), rng.normal(size=DRAWS)
     first, second = values + rng.normal(0.5, 0.3, size=30), values
@@ -194,12 +194,10 @@ def test_calibration_noise_of_both_rows_decides_a_rank_and_common_noise_does_not
         rows = {
             "a": contributions(first, both[0] * noise), "b": contributions(second, both[1] * noise)
         }  # fmt: skip
-        tests = {t.first: t for t in rank(rows).comparisons}
-        names[kind] = tests["a"]
-    assert names["none"].better
-    assert names["common"].better
-    assert (names["common"].low, names["common"].p) == (names["none"].low, names["none"].p)
-    assert not names["apart"].better
+        (names[kind],) = differences(rows, [("a", "b")])
+    assert names["none"].told
+    assert names["common"] == names["none"]
+    assert not names["apart"].told
     assert names["apart"].low < 0 < names["none"].low
 
 
@@ -231,17 +229,6 @@ def test_the_standard_error_has_both_sources_of_noise():
     certain = record(per_trajectory={"missed": np.ones((2, 10))})
     assert standard_error([certain], "missed") > 0.05
     assert math.isnan(standard_error([certain], "far"))
-
-
-def test_a_lead_may_rest_on_one_environment():
-    def row(*values):
-        cells = zip(("ant", "hopper", "walker2d"), values, strict=True)
-        return {0: {(e, "iid"): mean_of([value]) for e, value in cells}}
-
-    rows = {"a": row(0.9, 0.5, 0.5), "b": row(0.5, 0.6, 0.5), "c": row(0.4, 0.4, 0.4)}
-    held = {name: str(lead) for name, lead in leads(rows).items()}
-    assert held == {"a": "2/3", "b": "3/3"}
-    assert leads({name: {0: {("ant", "iid"): mean_of([0.5])}} for name in "ab"}) == {}
 
 
 @pytest.mark.slow

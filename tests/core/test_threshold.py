@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from sklearn.isotonic import IsotonicRegression
 
-from oodd_eval.metrics.bootstrap import drawn_seeds, shared_weights
+from oodd_eval.metrics.bootstrap import shared_weights
 from oodd_eval.metrics.threshold import DetectionThreshold, crossing, geometric_mean, isotonic
 
 STRENGTHS = (1.0, 4.0, 16.0)
@@ -123,11 +123,10 @@ def plain_draws(environment, found, counted, strengths):
     """Thresholds of all resamples, one after another, episode by episode."""
     seeds, rungs, n = found.shape
     weights = shared_weights(environment, n)
-    chosen = drawn_seeds(seeds, len(weights))
     logs = []
-    for r, row in enumerate(weights.astype(int).tolist()):
+    for row in weights.astype(int).tolist():
         episodes = [i for i, times in enumerate(row) for _ in range(times)]
-        picked = [(s, i) for s in chosen[:, r] for i in episodes]
+        picked = [(s, i) for s in range(seeds) for i in episodes]
         sums = [[sum(x[s, k, i] for s, i in picked) for k in range(rungs)]
                 for x in (found, counted)]  # fmt: skip
         logs.append(plain_threshold(*sums, strengths))

@@ -24,7 +24,7 @@ from oodd_eval.metrics.auc import Contribution
 from oodd_eval.metrics.binomial import clopper_pearson
 from oodd_eval.metrics.bootstrap import bootstrap_weights, cell_samples, drawn_cell, mean_interval
 from oodd_eval.metrics.catalogue import metric_info
-from oodd_eval.metrics.ranking import rank
+from oodd_eval.metrics.ranking import differences
 from oodd_eval.metrics.unpaired import (
     UnpairedScores,
     row_metrics,
@@ -509,26 +509,28 @@ def rows_of(shifts, metric=pool_of, m=20, n=25):
     }  # fmt: skip
 
 
-def test_rows_without_twins_are_ranked_by_both_samples():
-    ranking = rank(rows_of({"good": 1.5, "poor": 0.0, "same": 1.5}), resamples=2000)
-    assert ranking.ranks == {"good": 1, "same": 1, "poor": 3}
-    test = next(t for t in ranking.comparisons if (t.first, t.second) == ("good", "poor"))
-    assert test.low < test.difference < test.high
+def test_rows_without_twins_are_told_apart_by_both_samples():
+    rows = rows_of({"good": 1.5, "poor": 0.0, "same": 1.5})
+    told, equal = differences(rows, [("good", "poor"), ("good", "same")], resamples=2000)
+    assert told.told
+    assert told.low < told.difference < told.high
+    assert (equal.low, equal.high, equal.told) == (0.0, 0.0, False)
 
 
-def test_rows_of_other_samples_cannot_be_ranked_together():
+def test_rows_of_other_samples_cannot_be_compared():
     rows = rows_of({"one": 1.0}) | rows_of({"two": 1.0}, m=21, n=24)
     with pytest.raises(ResultsError, match="test trajectories in arm/"):
-        rank(rows)
+        differences(rows, [("one", "two")])
 
 
-def test_a_metric_of_anomalous_episodes_is_ranked_with_one_nominal_episode():
+def test_a_metric_of_anomalous_episodes_is_compared_with_one_nominal_episode():
     def delays(_, anomalous):
         both = np.append(0.0, -anomalous), np.append(0.0, np.ones(len(anomalous)))
         return Contribution(*both, nominal=1)
 
-    ranking = rank(rows_of({"slow": 3.0, "fast": 0.0}, delays), resamples=2000)
-    assert ranking.ranks == {"fast": 1, "slow": 2}
+    rows = rows_of({"slow": 3.0, "fast": 0.0}, delays)
+    (test,) = differences(rows, [("fast", "slow")], resamples=2000)
+    assert test.low > 0
 
 
 # -- from a split to tables -----------------------------------------------------------------------
