@@ -76,8 +76,8 @@ class Report:
         counts = f"{len(board.records)}, of which {ok} ok and {len(board.records) - ok} failed"
         distinct: list[Table] = []
         # Where records keep few metrics, the overview and a level's table are the same.
-        for table in self._tables(board):
-            if table and table not in distinct:
+        for table in filter(None, self._tables(board)):
+            if all((table.header, table.rows) != (t.header, t.rows) for t in distinct):
                 distinct.append(table)
         return Section(
             f"Split {board.split}",

@@ -141,25 +141,24 @@ class Tables:
         None when no record has any of them.
         """
         board, metric = self.board, self.board.ranking
-        first = (
-            [Column(metric, _heading(metric), intervals=True)] if self._present([metric]) else []
-        )
+        lacking = board.leaves_out([metric]) if board.paired else not self._present([metric])
+        first = [] if lacking else [Column(metric, _heading(metric), intervals=True)]
         environments = [e for e in board.environments if self._present([metric], [e])]
-        if first and len(environments) == 1:
-            kinds = [kind for kind in board.anomalies if cells_with(metric, self._of(kind))]
-            first += [Column(metric, kind, anomalies=[kind]) for kind in kinds[: len(TABLE1)]]
-            first = first[:1] if len(kinds) == 1 else first
+        kinds = [kind for kind in board.anomalies if cells_with(metric, self._of(kind))]
+        if first and len(environments) == 1 and 1 < len(kinds) <= len(TABLE1):
+            first += [Column(metric, kind, anomalies=[kind]) for kind in kinds]
         outcomes = metric == OUTCOME
         alarms = self.columns(self._at_level(*(_OUTCOMES if outcomes else _FIRST)))
         if not first and not alarms:
             return None
         info = metric_info(metric)
-        titles = [f"{info.title[0].upper()}{info.title[1:]}"] * bool(first)
+        titles = [info.title] * bool(first)
         titles += [f"guaranteed alarms at {percent_of(self.suffix)}"] * bool(alarms)
+        title = " and ".join(titles)
         note = _joined(
             self._promise(alarms), self._outcome_note() if outcomes else "", unranked(board)
         )
-        table = self.table(f"{' and '.join(titles)} (%)", [*first, *alarms], note)
+        table = self.table(f"{title[0].upper()}{title[1:]} (%)", [*first, *alarms], note)
         if len(environments) > 1:
             worst = [self._worst(entry, environments) for entry in self.order]
             for row, text in zip((table.header, *table.rows), (WORST, *worst), strict=True):

@@ -101,18 +101,23 @@ def column(table, name):
 
 
 def test_the_headline_has_its_columns_in_order_and_those_that_no_record_has_are_left_out():
-    table = table_titled(two_environments(), "Separability")
+    front = table_titled(two_environments(), "Pooled AUC and guaranteed alarms at 5 %")
+    assert front.header == ["detector", "pooled AUC", "worst environment", "missed",
+                            "false episodes"]  # fmt: skip
+    assert [row[2] for row in front.rows] == ["press 55.0", "arm 50.0", "arm 50.0"]
+    (section,) = Report(two_environments(), detail="wide").sections
+    table = next(t for t in section.tables if t.title.startswith("Separability"))
     assert table.header == [
         "detector", "pooled AUC", "null", "AUC of rows", "events found", "delay censored (steps)",
         "found within 100", "missed", "false episodes (≤ 5 %)", "early", "false alarms per hour",
     ]  # fmt: skip
     assert table.title.endswith("at 5 %")
-    assert [row[0] for row in table.rows] == ["mewma", "rf", "clock"]
+    assert [row[0] for row in table.rows] == ["mewma", "clock", "rf"]
     assert column(table, "pooled AUC") == {"mewma": "66.7", "rf": "50.0", "clock": "50.0"}
     assert re.fullmatch(r"16\.7 \[\d.*, \d.*\]", column(table, "false episodes (≤ 5 %)")["rf"])
     fewer = labelled(0.5, 0.6)
     del fewer["false_alarms_per_hour_at_5pct"]
-    header = table_titled([log_record("rf", values=fewer)], "Separability").header
+    header = table_titled([log_record("rf", values=fewer)], "Separability", "wide").header
     assert header == [name for name in table.header if "hour" not in name]
 
 
@@ -123,8 +128,7 @@ def test_ten_percent_is_shown_and_ranks_where_five_is_not_offered():
     ]
     board = Board(records)
     assert (board.ranking, board.alarm_ranking) == ("auc_pool", "delay_censored_at_10pct")
-    table = table_titled(records, "Separability")
-    assert "false episodes (≤ 10 %)" in table.header
+    table = table_titled(records, "Pooled AUC and guaranteed alarms at 10 %")
     assert "mewma, rf: guaranteed alarms at 5 % (30 calibration episodes" in table.note
     assert not [text for text in findings_of(board) if "calibration" in text]
     # One row with a statistic that takes half as many episodes does not leave the others blank.
@@ -138,11 +142,11 @@ def test_ten_percent_is_shown_and_ranks_where_five_is_not_offered():
         assert f"in at most {percent} % of nominal episodes: " in section.verdict
         assert bool(section.notes) == (not level)
     strict = Report(records, level="at_1pct").sections[0].tables[0]
-    assert strict.title == "Separability (%, higher is better)"
+    assert strict.title == "Pooled AUC (%)"
 
 
 def test_environments_stand_apart_and_count_once_in_their_mean():
-    table = table_titled(two_environments(), "Pooled AUC (%) by environment")
+    table = table_titled(two_environments(), "Pooled AUC (%) by environment", "wide")
     assert table.header == ["detector", "mean", "arm", "press"]
     assert table.rows[0] == ["mewma", "72.5", "90.0", "55.0"]  # and 66.7 over cells
     wide = Report(two_environments(), detail="wide").sections[0].tables
@@ -157,7 +161,7 @@ def test_environments_stand_apart_and_count_once_in_their_mean():
     groups = {"jam": "sensor", "leak": "dynamics"}
     grouped = [replace(r, group=groups.get(r.anomaly, "")) for r in two_environments()]
     assert Board(grouped).groups == {"sensor": ["jam"], "dynamics": ["leak"]}
-    header = table_titled(grouped, "Pooled AUC (%) by").header
+    header = table_titled(grouped, "Pooled AUC (%) by", "wide").header
     assert header[2:] == ["arm", "press", "sensor", "dynamics"]
 
 
@@ -194,12 +198,12 @@ def test_outcomes_are_one_table_with_the_clock_in_it_and_rank():
         log_record(d, values=outcome(auc, found))
         for d, auc, found in (("clock", 0.5, 0.0), ("mewma", 0.9, 0.5))
     ]
-    first, *others = Report(records, detail="brief").sections[0].tables
-    assert first.title.startswith("Episodes known by their outcome alone")
+    (front,) = Report(records, detail="brief").sections[0].tables
+    assert front.header == ["detector", "AUC of outcomes", "found outcome", "false episodes"]
+    first = table_titled(records, "Episodes known by their outcome alone", "wide")
     assert first.header[1:4] == ["AUC of outcomes", "found outcome", "found outcome null"]
     assert [row[:3] for row in first.rows] == [["mewma", "90.0", "50.0"], ["clock", "50.0", "0.0"]]
     assert "false episodes (≤ 5 %)" in first.header
-    assert not others
     assert Board(records).ranking == "auc_outcome"
     (alone,) = Tables(Board(records[1:])).of_logs()
     assert ("clock" in alone.note, "clock" in first.note) == (True, False)
@@ -227,15 +231,18 @@ def test_a_board_may_have_cells_of_every_kind():
         ("idle", "nominal", values),
     ]
     records = [log_record(d, e, a, values=v) for d in ("mewma", "clock") for e, a, v in kinds]
-    titles = [table.title for table in Report(records, detail="brief").sections[0].tables]
+    tables = {d: Report(records, detail=d).sections[0].tables for d in ("brief", "wide")}
+    titles = [table.title for table in tables["brief"]]
+    assert titles == ["Pooled AUC and guaranteed alarms at 5 % (%)",
+                      "Episodes known by their outcome alone (%) at 5 %"]  # fmt: skip
+    titles = [table.title for table in tables["wide"]][1:5]
     starts = ("Separability", "Episodes known", "Alarms on nominal", "Pooled AUC (%) by")
     assert all(map(str.startswith, titles, starts))
-    assert len(titles) == len(starts)
     assert titles[2].endswith(": idle")
-    assert table_titled(records, "Pooled AUC (%) by").header == ["detector", "mean", "arm", "pick"]
+    apart = tables["wide"][4]
+    assert apart.header == ["detector", "mean", "arm", "pick"]
     # The mean is over all environments that have the metric: it has no mark.
-    assert table_titled(records, "Pooled AUC (%) by").rows[0][1] == "70.0"
-    assert ranked(records).ranking.ranks.keys() == {"mewma", "clock"}
+    assert apart.rows[0][1] == "70.0"
 
 
 def test_metrics_of_rows_stand_in_a_table_of_their_own():
@@ -335,7 +342,8 @@ def test_show_prints_stored_records_and_one_detector(tmp_path, capsys):
     (tmp_path / "records.jsonl").write_text(lines)
     show = ["show", str(tmp_path), "--stored"]
     for options, title in (
-        ([], "Separability (%, higher is better) and guaranteed alarms at 5 %"),
+        ([], "Pooled AUC and guaranteed alarms at 5 %"),
+        (["--wide"], "Separability (%, higher is better) and guaranteed alarms at 5 %"),
         (["--detector", "rf"], "rf: pooled AUC (%) by anomaly"),
         (["--detector", "rf", "--metric", "auc_rows"], "rf: AUC of rows (%) by anomaly"),
     ):
