@@ -21,7 +21,9 @@ from oodd_eval.metrics.bootstrap import DrawnCells, drawn_cell, mean_interval
 from oodd_eval.metrics.catalogue import IntervalKind, metric_info
 from oodd_eval.metrics.recalibration import PairedScores, Recalibration
 from oodd_eval.metrics.unpaired import UnpairedScores, separability
-from oodd_eval.results.record import CodedDraws
+from oodd_eval.results.board import Board
+from oodd_eval.results.evaluate import Rules, cell_metrics
+from oodd_eval.results.record import CodedDraws, Record
 
 SEEDS: Final = (10, 20, 50)
 """Test seeds per environment: those of mini, reduced and standard."""
@@ -72,8 +74,8 @@ def _rates(rng: np.random.Generator, n: int) -> Terms:
 class Scenario:
     """Terms of a metric, drawn alike in a number of environments.
 
-    Several detector seeds are shifted by independent numbers of standard deviation `between`, in
-    each environment, and have the same test seeds.
+    Several detector seeds, which are fixed, are up to `between` apart from their mean, and have the
+    same test seeds.
     """
 
     title: str
@@ -98,7 +100,7 @@ class Scenario:
         cells = []
         for i in range(self.environments):
             top, bottom = self.draw(rng, n)
-            shifts = rng.normal(0, self.between, size=self.seeds) if self.between else [0.0]
+            shifts = np.linspace(-self.between, self.between, self.seeds)
             cells += [
                 drawn_cell(f"e{i}", seed, Contribution(top + shift * bottom, bottom))
                 for seed, shift in enumerate(shifts)
@@ -200,6 +202,95 @@ class Calibrated:
         return list(rng.normal(0, 0.3, size=(n, 1)) + rng.normal(size=(n, self.rows)))
 
 
+BOARDS: Final = 200
+"""Problems of `OnBoard`, whose mean is also the true value."""
+
+LEAST: Final = 0.93
+"""Share of boards whose intervals have to contain the true value."""
+
+ON_BOARD: Final = ("auc_matched", "found_within_20_at_5pct", "false_episodes_at_5pct")
+
+
+@dataclass(frozen=True)
+class OnBoard:
+    """A row's mean of a metric on a board: three environments, two anomalies, three fixed seeds.
+
+    Scores of a row are normal. Each episode has a level of its own, a part of which all detector
+    seeds share; environments, anomalies and seeds differ in how far scores rise at the effect. From
+    scores on, all is the product's: alarms from 40 calibration episodes, records with their terms
+    and calibration draws, and the board's mean with its interval.
+    """
+
+    title: str
+    metric: str
+
+    def coverage(self, n: int, problems: int = BOARDS) -> float:
+        """Return the share of problems whose interval contains the true value."""
+        values, lows, highs = np.array([_board(n, i)[self.metric] for i in range(problems)]).T
+        truth = values.mean()
+        return float(np.mean((lows <= truth) & (truth <= highs)))
+
+
+@functools.cache
+def _board(n: int, problem: int) -> dict[str, tuple[float, float, float]]:
+    """Return the metrics of `ON_BOARD` on one board, each with its interval."""
+    rng = np.random.default_rng([n, problem])
+    records = []
+    for e, environment in enumerate(("ant", "hopper", "acrobot")):
+        shared = [rng.normal(0, 0.25, size=size) for size in (40, n)]
+        noise = rng.normal(size=(n, _ROWS))
+        for seed in range(3):
+            own = [level + rng.normal(0, 0.15, size=level.size) for level in shared]
+            calibration = list(own[0][:, None] + rng.normal(size=(40, _ROWS)))
+            # Up to the effect an episode is its twin.
+            twins = own[1][:, None] + 0.8 * noise + 0.6 * rng.normal(size=noise.shape)
+            cells = []
+            for a in range(2):
+                rise = 0.6 + 0.6 * e + 0.4 * a + 0.1 * seed
+                after = rng.normal(rise, 0.4, size=(n, 1)) + rng.normal(size=(n, _ROWS))
+                anomalous = np.where(np.arange(_ROWS) < _EFFECT, twins, own[1][:, None] + after)
+                cells.append(PairedScores([*anomalous], [*twins], *[[_EFFECT] * n] * 2))
+            rules = Rules.fit(calibration)
+            draws = Recalibration.fit(calibration, "cusum", environment).of_cells(cells)
+            for anomaly, cell, drawn in zip(("iid", "gravity"), cells, draws, strict=True):
+                coded = CodedDraws.of(drawn)
+                metrics, terms = cell_metrics(cell, rules, environment=environment, draws=coded)
+                facts = {"environment": environment, "anomaly": anomaly, "seed": seed}
+                per_trajectory = {
+                    name: np.array([terms[name].numerator, terms[name].denominator])
+                    for name in ON_BOARD
+                }
+                records.append(
+                    Record(
+                        **_FACTS,
+                        **facts,
+                        metrics={name: metrics[name] for name in ON_BOARD},
+                        per_trajectory=per_trajectory,
+                        calibration_draws=coded,
+                        counts={"test": n},
+                    )
+                )
+    board = Board(records)
+    over = board.entries[0], board.environments, board.anomalies
+    means = {name: board.mean(*over, name, intervals=True) for name in ON_BOARD}
+    return {name: (mean.value, mean.low, mean.high) for name, mean in means.items()}
+
+
+_ROWS: Final = 120
+_EFFECT: Final = 40
+_FACTS: Final = {
+    "detector": "simulated",
+    "detector_version": "",
+    "plugin": "",
+    "parameters": {},
+    "group": "",
+    "horizon": 1,
+    "split": "simulated",
+    "split_digest": "0" * 64,
+    "status": "ok",
+    "protocol": 3,
+}
+
 TRUE_CALIBRATIONS: Final = 2000
 """Calibrations that the true values of `Calibrated` are means over."""
 
@@ -207,7 +298,7 @@ FALLS_SHORT: Final = "delays with 5 % misses"
 """The scenario whose intervals contain the true value too seldom: a resample holds no miss that the
 sample lacks."""
 
-SCENARIOS: Final[tuple[Scenario | TwoSamples | Calibrated, ...]] = (
+SCENARIOS: Final[tuple[Scenario | TwoSamples | Calibrated | OnBoard, ...]] = (
     Scenario("AUCs, skewed towards 1", _aucs, "share"),
     Scenario("AUCs, mean over 7 environments", _aucs, "share", 7),
     Scenario("delays, skewed", _delays, "mean"),
@@ -234,6 +325,10 @@ SCENARIOS: Final[tuple[Scenario | TwoSamples | Calibrated, ...]] = (
             ("censored delay, CUSUM", "delay_censored", "cusum"),
         )
         for noise, text in ((False, "test seeds alone"), (True, "with calibration noise"))
+    ),
+    *(
+        OnBoard(f"{metric_info(name).title} on a board, three fixed detector seeds", name)
+        for name in ON_BOARD
     ),
 )
 

@@ -3,8 +3,7 @@
 ``python benchmarks/leads.py ROW RESULTS [RESULTS ...]``, seconds. RESULTS are results directories
 or entries of the leaderboard, of one split; rows are taken at Δ = 1 with default parameters. For
 each environment the nearest row is printed, that whose paired 95 % interval of the lead in matched
-AUC begins lowest, and every row whose interval does not begin above 0. Test seeds and detector
-seeds are drawn.
+AUC begins lowest, and every row whose interval does not begin above 0. Test seeds are drawn.
 """
 
 import argparse

@@ -24,7 +24,7 @@ RANKING: Final = "auc_matched"
 """The metric that boards rank by."""
 
 ALARM_RANKING: Final = "delay_censored_at_5pct"
-"""The metric of the second ranking, by alarms."""
+"""The metric of alarms that rows are compared by."""
 
 LEVELS: Final[Mapping[str, float]] = MappingProxyType(
     {"at_10pct": 0.10, "at_5pct": 0.05, "at_1pct": 0.01}

@@ -670,7 +670,7 @@ def uncalibrated(board: Board) -> list[str]:
     named = ", ".join(lacking)
     if len(have) < len(lacking):
         named = f"all rows but {', '.join(have)}" if have else "all rows"
-    sentence = "Intervals of alarms, and ranks by them, leave out the noise of the calibration"
+    sentence = "Intervals of alarms leave out the noise of the calibration"
     return [f"{sentence} episodes where records of earlier versions do not say it: {named}."]
 
 

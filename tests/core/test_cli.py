@@ -354,7 +354,7 @@ def test_show_prints_what_the_run_printed(run, clock):
     code, shown, _ = run("show", clock)
     assert code == 0
     tables = shown[: shown.index("Split tiny")]
-    assert "Separability" in tables
+    assert "Matched AUC" in tables
     reason = "4 calibration episodes; 38 needed at 5 %"
     assert f"Undefined for clock: guaranteed alarms at 5 % ({reason})." in " ".join(tables.split())
     assert tables in printed

@@ -256,7 +256,7 @@ def test_a_text_of_results_is_what_the_terminal_shows(tiny_split, tmp_path, caps
     assert main(["show", str(tmp_path / "out"), "--split", str(tiny_split)]) == 0
     heading, _, printed = capsys.readouterr().out.partition("\n\n")
     assert heading.startswith("split tiny, digest ")
-    assert "Separability" in printed
+    assert "Matched AUC" in printed
     for same in (results, load_results(tmp_path / "out", tiny_split)):
         assert f"{same}\n" == printed
         assert repr(same) == f"Results(4 cells of {same[0].split}: range, clock; 4 ok)"

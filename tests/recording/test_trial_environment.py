@@ -28,7 +28,7 @@ def test_the_page_leads_to_a_board_of_ones_own(session, capsys):
     for command in commands(PAGE):
         assert session.run(command) == 0, command
     told = capsys.readouterr().out
-    board = told[told.index("Separability") :]
+    board = told[told.index("Matched AUC") :]
     assert re.search(r"mewma +[│|]? *\d", board)
     assert "pendulum" in board
     assert "8 ok" in board
