@@ -100,7 +100,6 @@ class Report:
         yield from strengths.overview(places=full, whole=not brief)
         if not brief:
             yield means.separability() if board.paired and ranked else None
-            yield means.guaranteed() if board.paired else None
             yield means.seeds()
             yield means.attribution()
             yield None if board.leaves_out(_WITHOUT_ALARM) else means.all_metrics()

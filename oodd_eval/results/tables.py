@@ -82,12 +82,6 @@ _SIMPLE: Final = (
 
 CLOCK: Final = "clock"  # the row that knows the phase of an episode and nothing else
 
-_WITHIN: Final = tuple(f"found_within_{k}" for k in catalogue.FOUND_WITHIN)
-_ALARMS: Final = (
-    *("delay_censored", "missed", *_WITHIN, f"{_WITHIN[-1]}_null", "false_episodes", "early"),
-)
-"""Columns of a table of guaranteed alarms. The null of the longest span is the largest."""
-
 PAPERS: Final = ("delay", "delay_null", "delay_censored", "missed", "far", "far_twin")
 _PAPERS_NULLS: Final = ("delay_null", "far_twin")
 
@@ -101,7 +95,7 @@ WORST: Final = "worst environment"
 """Heading of the column that has the environment in which a row is worst."""
 
 _ALARMS_OF_LOGS: Final = (
-    *("events_found", "delay_censored", _WITHIN[-1], "missed"),
+    *("events_found", "delay_censored", f"found_within_{catalogue.FOUND_WITHIN[-1]}", "missed"),
     *("false_episodes", "early", "false_alarms_per_hour"),
 )
 
@@ -201,36 +195,31 @@ class Tables:
         return self.level or strictest.removeprefix("false_episodes_")
 
     def separability(self) -> Table:
-        """Return matched AUC by anomaly group and by environment.
-
-        Beside the mean over all cells stand that of smoothed scores and that against another twin,
-        where records have them.
-        """
+        """Return matched AUC by anomaly group and by environment."""
         board = self.board
-        beside = {name.removeprefix("auc_"): name for name in board.present(_BESIDE_MATCHED)}
-        columns = by_group(board, "mean") + [Column(name, title) for title, name in beside.items()]
+        columns = by_group(board, "mean")
         columns += [Column(board.ranking, name, [name]) for name in board.environments]
         title = "Separability: matched AUC (%), higher is better. The leaderboard ranks by this."
-        note = _joined(explained(beside), unranked(board))
-        return self.table(title, self._with_ends(columns), note)
+        return self.table(title, self._with_ends(columns), unranked(board))
 
-    def guaranteed(self, *, nulls: bool = False) -> Table | None:
-        """Return guaranteed alarms at a level, mean over cells; None when no record has them.
+    def all_alarms(self) -> list[Table]:
+        """Return guaranteed alarms at every level that records have, with their nulls."""
+        levels = [replace(self, level=suffix) for suffix in catalogue.LEVELS]
+        return [table for of_level in levels if (table := of_level.guaranteed())]
 
-        With `nulls` each figure stands beside what false alarms alone give.
-        """
-        suffix = self.suffix
-        bases = catalogue.GUARANTEED if nulls else _ALARMS
-        columns = self.columns(f"{name}_{suffix}" for name in bases)
+    def guaranteed(self) -> Table | None:
+        """Return guaranteed alarms at the level of the tables; None when no record has them."""
+        columns = self.columns(self._at_level(*catalogue.GUARANTEED))
         if not columns:
             return None
         names = [column.metric for column in columns]
-        hours = f"false_alarms_per_hour_{suffix}"
+        hours, *censored = self._at_level("false_alarms_per_hour", "delay_censored")
         hourly = f"{metric_info(hours).noun}, " * (hours in names)
         steps = "delays in steps, " * any(name.startswith("delay") for name in names)
         units = f"{steps}{hourly}the rest in %" if steps or hourly else "%"
-        note = _joined(self._promise(columns), CENSORED * (f"delay_censored_{suffix}" in names))
-        return self.table(f"Guaranteed alarms at {percent_of(suffix)} ({units})", columns, note)
+        note = _joined(self._promise(columns), CENSORED * ({*censored} <= {*names}))
+        title = f"Guaranteed alarms at {percent_of(self.suffix)} ({units})"
+        return self.table(title, columns, note)
 
     def seeds(self) -> Table | None:
         """Return the means of the lowest and the highest detector seed; None with one seed each."""
@@ -270,11 +259,6 @@ class Tables:
         printed = [info for info in infos if not info.request and not info.paper]
         columns = [Column(info.name, info.title, intervals=self.intervals) for info in printed]
         return self.table("All metrics of separability (%), mean over cells", columns)
-
-    def all_alarms(self) -> list[Table]:
-        """Return guaranteed alarms at every level that records have, with their nulls."""
-        levels = (replace(self, level=suffix) for suffix in catalogue.LEVELS)
-        return [table for of in levels if (table := of.guaranteed(nulls=True))]
 
     def anomaly_groups(self) -> list[Table]:
         """Return AUC, delay and false-alarm rate by environment: the paper's Table 5.
@@ -453,7 +437,6 @@ class Tables:
         return Table(title, header, cells, len(self.label_names), note, wrap=not self.board.paired)
 
 
-_BESIDE_MATCHED: Final = ("auc_smoothed", "auc_unpaired")
 _TABLE_5: Final = ("auc", "delay", "far")
 _FIRST: Final = (f"found_within_{catalogue.FOUND_WITHIN[0]}", "missed", "false_episodes")
 _OUTCOMES: Final = ("found_outcome", "false_episodes")

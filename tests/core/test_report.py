@@ -54,7 +54,6 @@ def cells(table, row):
 TITLES = {  # by the start of a title: columns of labels, and one number: row, column, text
     "Matched AUC and guaranteed alarms at 5 % (%)": (1, "riqn", "worst environment", "ant 67.5"),
     "Separability": (1, "riqn", "mean", "67.5"),
-    "Guaranteed alarms at 5 % (%)": (1, "riqn", "found within 20", "50.0"),
     "Guaranteed alarms at 5 % (delays in steps": (1, "riqn", "delay if found", "8.0"),
     f"{PAPER} (delays in steps, the rest as shares)": (1, "riqn", "delay", "3.2"),
     f"{PAPER}. AUC (%), delay (steps), false-alarm rate (FAR), sen": (2, "Hopper", "AVG", "85.0"),
@@ -241,8 +240,8 @@ def test_separability_is_by_mean_matched_auc_with_failures_last():
     assert [row[0] for row in table.rows] == ["riqn", "persistence", "clock", "rf"]
     # riqn: iid 0.7; gravity (0.6 + 0.7) / 2 = 0.65; mean 0.675.
     assert cells(table, 0) == {
-        "detector": "riqn", "mean": "67.5", "sensor": "70.0", "dynamics": "65.0",
-        "smoothed": "50.0", "unpaired": "50.0", "ant": "67.5", "hopper": "67.5",
+        "detector": "riqn", "mean": "67.5", "sensor": "70.0", "dynamics": "65.0", "ant": "67.5",
+        "hopper": "67.5",
     }  # fmt: skip
     # One environment failed: no mean over the other pretends to be one over all.
     assert (cells(table, 3)["mean"], cells(table, 3)["hopper"]) == ("timeout", "72.5")
@@ -332,26 +331,24 @@ ALARMS = {
 }  # fmt: skip
 
 
-def test_guaranteed_alarms_stand_beside_false_episodes_with_their_interval():
+def test_guaranteed_alarms_stand_beside_their_nulls():
     board = Board([make_record(anomaly=a, values=ALARMS) for a in ("iid", "drift")])
-    table = Tables(board).guaranteed()
+    (table,) = Tables(board).all_alarms()
     assert cells(table, 0) == {
-        "detector": "riqn", "delay censored": "20.0", "missed": "50.0", "found within 20": "50.0",
-        "found within 100": "50.0", "found within 100 null": "50.0",
-        "false episodes": "50.0 [1.3, 98.7]", "early": "0.0",
+        "detector": "riqn", "false episodes": "50.0 [1.3, 98.7]", "early": "0.0",
+        "delay censored": "20.0", "delay if found": "4.0", "missed": "50.0",
+        "found within 20": "50.0", "found within 100": "50.0", "found within 100 null": "50.0",
     }  # fmt: skip
     assert "whole remainder" in table.note
-    nulls = Tables(board).guaranteed(nulls=True)
-    assert cells(nulls, 0)["delay if found"] == "4.0"
-    assert nulls.header[-2:] == ["found within 100", "found within 100 null"]
+    assert table.header[-2:] == ["found within 100", "found within 100 null"]
 
 
-def test_the_table_of_alarms_is_of_the_strictest_level_where_5_percent_is_not_offered():
-    assert Tables(Board([make_record()])).guaranteed() is None
+def test_alarms_are_of_the_strictest_level_where_5_percent_is_not_offered():
+    assert Tables(Board([make_record()])).all_alarms() == []
     few = {"false_episodes_at_10pct": [0, 0], "missed_at_10pct": [0, 1]}
-    assert "at 10 %" in Tables(Board([make_record(values=few)])).guaranteed().title
+    assert "at 10 %" in Tables(Board([make_record(values=few)])).headline().title
     both = few | {"missed_at_1pct": [1, 1], "false_episodes_at_1pct": [0, 0]}
-    assert "at 1 %" in Tables(Board([make_record(values=both)])).guaranteed().title
+    assert "at 1 %" in Tables(Board([make_record(values=both)])).headline().title
     assert len(Tables(Board([make_record(values=both | ALARMS)])).all_alarms()) == 3
 
 
@@ -456,12 +453,12 @@ def calibrated(detector, episodes, alarm="cusum", level="5", environment="hopper
 def test_a_level_that_calibration_episodes_are_too_few_for_is_named():
     # A CUSUM standardizes with half of them: 2 x 19 are needed at 5 %, 2 x 9 at 10 %.
     few, strict = calibrated("rf", 30, level="10"), calibrated("pe", 40)
-    assert "rf: guaranteed alarms at 5 % (30" in Tables(Board([few])).guaranteed().note
+    assert "rf: guaranteed alarms at 5 % (30" in Tables(Board([few])).headline().note
     mixed = Board([few, calibrated("pe", 30, "score")])
-    table = Tables(mixed).guaranteed()
+    table = Tables(mixed).headline()
     assert "at 5 %" in table.title
-    assert cells(table, 1) == dict.fromkeys(table.header, "\N{EN DASH}") | {"detector": "rf"}
-    assert "Undefined for rf: missed, false episodes, early (30" in table.note
+    assert [cells(table, 1)[name] for name in ("missed", "false episodes")] == ["\N{EN DASH}"] * 2
+    assert "Undefined for rf: missed, false episodes (30" in table.note
     (section,) = Report([few], level="at_10pct").sections
     chosen = next(t for t in section.tables if "Guaranteed" in t.title)
     assert ("at 10 %" in chosen.title, "calibration" in chosen.note) == (True, False)
@@ -470,7 +467,7 @@ def test_a_level_that_calibration_episodes_are_too_few_for_is_named():
     assert any("pe: guaranteed alarms at 1 % (40" in text for text in section.findings)
     # Without any level there is no table, and the report says why.
     none = replace(calibrated("rf", 17), metrics={}, per_trajectory={})
-    assert Tables(Board([none])).guaranteed() is None
+    assert Tables(Board([none])).all_alarms() == []
     assert "(17 calibration episodes" in " ".join(findings_of(Board([none])))
 
 
@@ -480,7 +477,7 @@ def test_a_level_that_calibration_episodes_are_too_few_for_is_named():
 )
 def test_the_number_of_calibration_episodes_is_a_reason_where_it_is_one(episodes, alarm, needed):
     record = calibrated("pe", episodes, alarm)
-    note = Tables(Board([record])).guaranteed().note
+    note = Tables(Board([record])).headline().note
     if not needed:
         assert "calibration" not in note
         return
