@@ -372,7 +372,7 @@ def _has_few_finds(records: Sequence[Record], metric: str) -> bool:
         return False
     terms = [r.per_trajectory[metric] for r in records if metric in r.per_trajectory]
     finds = sum(np.count_nonzero(denominators) for _, denominators in terms)
-    return finds < _FEWEST_FINDS * len({r.seed for r in records})
+    return bool(finds < _FEWEST_FINDS * len({r.seed for r in records}))
 
 
 _FEWEST_FINDS: Final = 10  # a seed, below which a mean delay of found episodes has no interval
