@@ -208,6 +208,9 @@ BOARDS: Final = 200
 LEAST: Final = 0.93
 """Share of boards whose intervals have to contain the true value."""
 
+CALIBRATION: Final = {10: 40, 20: 50, 50: 200}
+"""Calibration episodes by test seeds: those of mini, reduced and standard."""
+
 ON_BOARD: Final = ("auc_matched", "found_within_20_at_5pct", "false_episodes_at_5pct")
 
 
@@ -217,8 +220,8 @@ class OnBoard:
 
     Scores of a row are normal. Each episode has a level of its own, a part of which all detector
     seeds share; environments, anomalies and seeds differ in how far scores rise at the effect. From
-    scores on, all is the product's: alarms from 40 calibration episodes, records with their terms
-    and calibration draws, and the board's mean with its interval.
+    scores on, all is the product's: alarms from calibration episodes, records with their terms and
+    calibration draws, and the board's mean with its interval.
     """
 
     title: str
@@ -237,11 +240,11 @@ def _board(n: int, problem: int) -> dict[str, tuple[float, float, float]]:
     rng = np.random.default_rng([n, problem])
     records = []
     for e, environment in enumerate(("ant", "hopper", "acrobot")):
-        shared = [rng.normal(0, 0.25, size=size) for size in (40, n)]
+        shared = [rng.normal(0, 0.25, size=size) for size in (CALIBRATION[n], n)]
         noise = rng.normal(size=(n, _ROWS))
         for seed in range(3):
             own = [level + rng.normal(0, 0.15, size=level.size) for level in shared]
-            calibration = list(own[0][:, None] + rng.normal(size=(40, _ROWS)))
+            calibration = list(own[0][:, None] + rng.normal(size=(CALIBRATION[n], _ROWS)))
             # Up to the effect an episode is its twin.
             twins = own[1][:, None] + 0.8 * noise + 0.6 * rng.normal(size=noise.shape)
             cells = []

@@ -53,8 +53,7 @@ class Standing:
     equal
         Whether it is not told from the ranked row above it.
     band
-        Whether it is in the first band: neither it nor a ranked row above it is told from the
-        first.
+        Whether it is in the first band: it is the first, or not told from the first.
     state
         Why it is not ranked; empty where it is, or where nothing but a ranking is missing.
     variant
@@ -200,7 +199,7 @@ def ordered(
     if above:  # both families hold the pair of the first two rows: the larger p-value counts
         second = places[1]
         above[second] = first[second] = max(above[second], first[second], key=lambda d: d.p)
-    band = [*places[:1], *itertools.takewhile(lambda e: not first[e].told, places[1:])]
+    band = [e for e in places if e not in first or not first[e].told]
     ranks = {e: 1 if e in band else i for i, e in enumerate(places, 1)}
     standings = []
     for row in order:
