@@ -1,13 +1,15 @@
 """Coverage of the 95 % intervals, by simulation: ``python benchmarks/coverage.py``.
 
 Each problem draws the terms of a metric for a number of test seeds per environment and asks whether
-its interval contains the true value. The table stands in docs/metrics.md.
+its interval contains the true value. The table stands in docs/metrics.md. Exit code 1 where a mean
+on a board is covered in less than 93 %. 20 minutes.
 """
 
 from __future__ import annotations
 
 import functools
 import math
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final
@@ -343,10 +345,13 @@ def table(problems: int = PROBLEMS) -> str:
         "|---|" + "---|" * len(SEEDS),
     ]
     for scenario in SCENARIOS:
-        shares = [f"{100 * scenario.coverage(n, problems):.1f}" for n in SEEDS]
+        several = BOARDS if isinstance(scenario, OnBoard) else problems
+        shares = [f"{100 * scenario.coverage(n, several):.1f}" for n in SEEDS]
         lines.append("| " + " | ".join([scenario.title, *shares]) + " |")
     return "\n".join(lines)
 
 
 if __name__ == "__main__":
     print(table())
+    boards = [(s, n) for s in SCENARIOS if isinstance(s, OnBoard) for n in SEEDS]
+    sys.exit(int(any(scenario.coverage(n) < LEAST for scenario, n in boards)))

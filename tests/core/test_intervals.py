@@ -205,7 +205,7 @@ def coverage_script():
 def test_intervals_of_100_samples_cover_the_truth():
     script = coverage_script()
     for scenario in script.SCENARIOS:
-        if not isinstance(scenario, script.Calibrated):
+        if not isinstance(scenario, (script.Calibrated, script.OnBoard)):
             expected = 0.9 if scenario.title != "delays with 5 % misses" else 0.75
             assert scenario.coverage(20, problems=100) >= expected, scenario.title
 
@@ -215,8 +215,8 @@ def test_with_20_seeds_95_percent_intervals_cover_at_least_91_percent():
     script = coverage_script()
     text = (ROOT / "docs/metrics.md").read_text(encoding="utf-8")
     for scenario in script.SCENARIOS:
-        if isinstance(scenario, script.Calibrated):
-            continue  # see below
+        if isinstance(scenario, (script.Calibrated, script.OnBoard)):
+            continue  # see below, and what takes minutes
         row = re.search(rf"^\| {re.escape(scenario.title)} \|(.*)\|$", text, re.MULTILINE)
         documented = [float(cell) for cell in row[1].split("|")]
         assert len(documented) == len(script.SEEDS)
