@@ -53,7 +53,13 @@ def describe(
     text = "{train} training, {calibration} calibration trajectories, {test} test seeds; "
     how = "imported"
     if "seed_base" in definition:
-        cap = definition["episode_cap"] or "the simulator's"
+        caps = {
+            definition.get("by_environment", {})
+            .get(name, {})
+            .get("episode_cap", definition["episode_cap"])
+            for name in split.environments
+        }
+        cap = " or ".join(str(cap or "the simulator's") for cap in sorted(caps, key=str))
         seeds = f"seed base {definition['seed_base']}"
         if "drawn" in definition:
             seeds = f"seeds of 128 random bits with SHA-256 {definition['drawn'][:12]}"

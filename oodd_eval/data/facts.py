@@ -8,7 +8,7 @@ import json
 import math
 import tomllib
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, Literal, get_args
@@ -195,6 +195,8 @@ class SplitDefinition:
         gives an episode's number. Empty where it gives the seed.
     environments
         Those of the split; empty for the seven of the benchmark.
+    by_environment
+        Values of `episode_cap`, `noise` and `strengths` that are an environment's own.
     """
 
     name: str
@@ -209,6 +211,21 @@ class SplitDefinition:
     strengths: Mapping[str, float] = field(default_factory=dict)
     drawn: str = ""
     environments: tuple[str, ...] = ()
+    by_environment: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    def of(self, environment: str) -> "SplitDefinition":
+        """Return the definition with the values that are an environment's own.
+
+        Parameters
+        ----------
+        environment
+            Its name.
+
+        Returns
+        -------
+        SplitDefinition
+        """
+        return replace(self, by_environment={}, **self.by_environment.get(environment, {}))
 
     @property
     def recipe(self) -> dict[str, Any]:
@@ -216,7 +233,7 @@ class SplitDefinition:
         recipe = {field.name: getattr(self, field.name) for field in fields(self)}
         # Older manifests lack these.
         later = {"suite": "table1", "base": "", "noise": 0.0, "strengths": {}, "drawn": ""}
-        later["environments"] = []
+        later |= {"environments": [], "by_environment": {}}
         recipe["environments"] = list(self.environments)  # as JSON has it
         return {n: value for n, value in recipe.items() if n not in later or value != later[n]}
 

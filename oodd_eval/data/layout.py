@@ -380,7 +380,9 @@ def _manifest_schema() -> Any:
     schema = core_schema.literal_schema([SCHEMA, LOGS_SCHEMA])
     environments = by_name(name, environment)
     recipe = record()
-    recipe["fields"]["strengths"] = core_schema.typed_dict_field(strengths, required=False)
+    own = by_name(name, record())
+    for key, optional in (("strengths", strengths), ("by_environment", own)):
+        recipe["fields"][key] = core_schema.typed_dict_field(optional, required=False)
     named = {"name": text, "definition": recipe, "generator": core_schema.int_schema()}
     manifest = record(schema=schema, **named, environments=environments, digest=text)
     manifest["fields"]["licence"] = core_schema.typed_dict_field(text, required=False)

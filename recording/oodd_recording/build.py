@@ -129,7 +129,8 @@ def build_split(
     `UsageError` for a wrong size, or another split in the directory.
     """
     names = in_order(ENVIRONMENTS if environments is None else environments, ENVIRONMENTS)
-    _check_sizes(definition)
+    for name in names:
+        _check_sizes(definition.of(name))
     if definition.drawn != ("" if bits is None else digest_of_bits(bits)):
         raise UsageError(
             f"seeds of split {definition.name!r} come from bits with SHA-256 "
@@ -232,6 +233,7 @@ def _check_sizes(definition: SplitDefinition) -> None:
 
 def _check_strengths(definition: SplitDefinition, environment: str) -> None:
     """Raise `UsageError` for kinds that an environment cannot have, and beyond their bounds."""
+    definition = definition.of(environment)
     calibrated = definition.suite == "ladder" and ladder_of(environment)
     if not definition.strengths and environment not in ENVIRONMENTS and not calibrated:
         raise UsageError(
@@ -284,6 +286,7 @@ def _kept(definition: SplitDefinition, directory: Path, digests: dict[str, str])
 
 def _conditions(definition: SplitDefinition, environment: str) -> dict[Condition, float | None]:
     """Return the strength of each condition to record; None stands for the values of Table 1."""
+    definition = definition.of(environment)
     if definition.strengths:
         return {Condition.parse(name): number for name, number in definition.strengths.items()}
     return conditions_of(definition.suite, environment, definition.episode_cap)
@@ -316,10 +319,10 @@ def _base(
 def _chunks(
     definition: SplitDefinition, environment: str, path: str, digest: str, bits: int | None
 ) -> list[Chunk]:
-    conditions = tuple(_conditions(definition, environment).items())
+    of, conditions = definition.of(environment), tuple(_conditions(definition, environment).items())
 
     def chunk(part: str, first: int, count: int) -> Chunk:
-        recipe = definition.episode_cap, definition.noise, conditions if part == "test" else ()
+        recipe = of.episode_cap, of.noise, conditions if part == "test" else ()
         return Chunk(environment, part, first, count, *recipe, bits, digest, path)
 
     if definition.base:  # its test seeds have twins that are long enough
