@@ -17,8 +17,9 @@ An entry with neither requirement nor wheel is a row that oodd-eval ships. Readi
 nothing of theirs.
 """
 
+import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Final, Literal
@@ -28,6 +29,7 @@ from pydantic import TypeAdapter, ValidationError
 from oodd_eval.data.bounded import read_toml
 from oodd_eval.errors import ResultsError
 from oodd_eval.plugins.contract import Training
+from oodd_leaderboard import formats
 
 ENTRY: Final = "entry.toml"
 
@@ -104,11 +106,41 @@ def read_entry(path: Path) -> Entry:
     if "name" in content:
         raise ResultsError(f"{path}: name is the file's, expected no field of that name")
     try:
-        return TypeAdapter(Entry).validate_python({"name": name, "detector": name, **content})
+        fields = json.dumps({"name": name, "detector": name, **content}, default=str)
+        entry = TypeAdapter(Entry).validate_json(fields)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        where = ".".join(map(str, first["loc"]))
-        raise ResultsError(f"{path}: {where}: {first['msg']}, got {first['input']!r:.80}") from None
+        at = ".".join(formats.short(str(part))[1:-1] for part in first["loc"])
+        value = formats.short(first["input"])
+        raise ResultsError(f"{path}: {at}: {first['msg']}, got {value}") from None
+    for name, problem in _problems(entry):
+        raise ResultsError(f"{path}: {name} {problem}")
+    return entry
+
+
+def _problems(entry: Entry) -> Iterator[tuple[str, str]]:
+    """Yield fields that no page can show, or no file can have as its name."""
+    for name, rule in _RULES.items():
+        if (value := getattr(entry, name)) and (problem := rule.complaint(value)):
+            yield name, problem
+    yield from formats.unsafe(dict(entry.parameters), "parameters")
+    if entry.requirement and entry.wheel:
+        yield "wheel", "is there beside requirement, expected one of the two"
+    if not entry.shipped and not entry.sha256:
+        yield "sha256", "is missing, expected the digest of what pip installs"
+    if not entry.shipped and entry.origin != "others":
+        yield "origin", f"is {entry.origin!r}, expected 'others' for a row that is not shipped"
+
+
+_RULES: Final = {
+    "name": formats.ENTRY_NAME,
+    "detector": formats.NAME,
+    "requirement": formats.text(200),
+    "wheel": formats.WHEEL,
+    "sha256": formats.DIGEST,
+    **dict.fromkeys(("authors", "paper", "licence"), formats.text(300)),
+    "url": formats.URL,
+}
 
 
 def read_entries(directory: Path) -> list[Entry]:
