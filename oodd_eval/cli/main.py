@@ -62,6 +62,10 @@ LEADERBOARD: Final[Commands] = {
         "oodd_leaderboard.commands.entries:submit",
     ),
     "verify": ("check entries as data", "oodd_leaderboard.commands.entries:verify"),
+    "season": (
+        "run every entry on a fresh split (extra sim)",
+        "oodd_leaderboard.commands.season:season",
+    ),
     "build": ("render tables and site from the entries", "oodd_leaderboard.commands.entries:build"),
 }
 

@@ -380,8 +380,8 @@ def _manifest_schema() -> Any:
     schema = core_schema.literal_schema([SCHEMA, LOGS_SCHEMA])
     environments = by_name(name, environment)
     recipe = record()
-    own = by_name(name, record())
-    for key, optional in (("strengths", strengths), ("by_environment", own)):
+    by_environment = by_name(name, record())
+    for key, optional in (("strengths", strengths), ("by_environment", by_environment)):
         recipe["fields"][key] = core_schema.typed_dict_field(optional, required=False)
     named = {"name": text, "definition": recipe, "generator": core_schema.int_schema()}
     manifest = record(schema=schema, **named, environments=environments, digest=text)

@@ -44,11 +44,11 @@ def season_definition(
     Those of an environment depend on its name and the bits alone. The specs of `environments` have
     to be registered.
     """
-    own: dict[str, dict[str, object]] = {}
+    by_environment: dict[str, dict[str, object]] = {}
     for environment in in_order(environments, SEASON_ENVIRONMENTS):
-        own[environment] = {"strengths": _strengths(bits, environment)}
+        by_environment[environment] = {"strengths": _strengths(bits, environment)}
         if environment not in ENVIRONMENTS:
-            own[environment] |= {"episode_cap": sizes.cap, "noise": 0.0}
+            by_environment[environment] |= {"episode_cap": sizes.cap, "noise": 0.0}
     digest = digest_of_bits(bits)
     return SplitDefinition(
         name=f"season-{digest[:8]}",
@@ -59,8 +59,8 @@ def season_definition(
         seed_base=0,
         noise=NOISE,
         drawn=digest,
-        environments=tuple(own),
-        by_environment=own,
+        environments=tuple(by_environment),
+        by_environment=by_environment,
     )
 
 
