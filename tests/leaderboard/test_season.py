@@ -1,0 +1,173 @@
+"""A season from nothing to its records: complete, resumable, and the same for the same bits."""
+
+import dataclasses
+import shutil
+
+import pytest
+from helpers_processes import environment, oodd_eval, wait_until
+from oodd_leaderboard.season_files import read_season, row_path, write_season
+
+from oodd_eval import load_split
+from oodd_eval.cli.main import main
+from oodd_eval.results.directory import read_records
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not shutil.which("bwrap"), reason="needs bubblewrap"),
+]
+pytest.importorskip("gymnasium")
+
+BITS = "7e0c5a4df6db7db56e4a2ab8c1e4c9a1"
+SMALL = ("--env", "cartpole,tank", "--train", 4, "--calibration", 20, "--test", 4, "--cap", 80)
+ROWS = ("mewma", "oracle-gym", "random")
+VOLATILE = {"seconds_fit": 0.0, "seconds_score": 0.0, "peak_rss_mb": 0.0, "provenance": {}}
+
+
+def season(directory, *arguments, entries=None):
+    """Run a small season in this process; return its exit code."""
+    named = () if entries is None else ("--entries", entries)
+    words = ("leaderboard", "season", *named, "--output", directory, *SMALL, *arguments)
+    return main([*map(str, words)])
+
+
+def steady(directory):
+    """Return the records of a season without what differs from run to run."""
+    records = read_season(directory).records(directory)
+    return [dataclasses.replace(record, **VOLATILE) for record in records]
+
+
+@pytest.fixture(scope="module")
+def entries(tmp_path_factory):
+    directory = tmp_path_factory.mktemp("entries")
+    for name in ROWS:
+        (directory / f"{name}.toml").write_text('authors = "A test"\n')
+    (directory / "short.toml").write_text('detector = "mewma"\nparameters = {clip = 2.0}\n')
+    return directory
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory, entries):
+    """A season that nothing has ended; `oracle-gym` has no equations of the tank."""
+    directory = tmp_path_factory.mktemp("seasons") / "whole"
+    assert season(directory, "--bits", BITS, entries=entries) == 1
+    return directory
+
+
+def test_a_season_is_whole_when_every_row_has_every_cell(whole, entries):
+    read = read_season(whole)
+    assert (read.bits, read.seeds, read.trial, read.name) == (BITS, [0, 1, 2], True, "whole")
+    assert read.date
+    assert read.split.digest == load_split(whole / "split").digest
+    assert {*read.entries} == {*ROWS, "short"}
+    records = read.records(whole)
+    assert read.missing(records) == []
+    assert {r.position for r in records} == read.expected
+    assert {(r.detector, r.seed) for r in records} == {
+        ("mewma", 0), ("short", 0), ("oracle-gym", 0),
+        ("random", 0), ("random", 1), ("random", 2),
+    }  # fmt: skip
+
+
+def test_rows_without_all_cells_are_told(whole):
+    read = read_season(whole)
+    records = read.records(whole)
+    assert read.missing(r for r in records if r.detector != "random") == ["random: not run"]
+    few = [r for r in records if (r.detector, r.environment, r.seed) != ("random", "tank", 1)]
+    (line,) = read.missing(few)
+    assert line.startswith("random")
+    assert "tank" in line
+    assert "cartpole" not in line
+
+
+def test_what_fails_is_the_reason_of_a_row(whole):
+    by_environment = {r.environment: r for r in steady(whole) if r.detector == "oracle-gym"}
+    assert by_environment["tank"].status == "incompatible"
+    assert by_environment["tank"].reason
+    assert by_environment["cartpole"].ok
+
+
+def test_a_row_has_the_name_of_its_entry(whole):
+    (records,) = (read_records(row_path(whole, "short")),)
+    assert {r.detector for r in records} == {"short"}
+    assert {r.overrides["clip"] for r in records} == {2.0}
+
+
+def test_killed_at_three_moments_it_goes_on_to_the_same_records(whole, entries, tmp_path):
+    directory = tmp_path / "killed"
+    words = ("leaderboard", "season", "--entries", entries, "--output", directory, *SMALL)
+
+    def recorded():
+        return [*(directory / "split" / ".building").glob("*.npz")]
+
+    def scored():
+        return [*(directory / "work" / "mewma" / "scores").glob("*.h5")]
+
+    def written():
+        return row_path(directory, "mewma").is_file()
+
+    for moment in (recorded, scored, written):
+        process = oodd_eval(*words, "--bits", BITS, "--jobs", 1, env=environment("", tmp_path))
+        assert wait_until(lambda moment=moment, process=process: moment() or process.poll())
+        assert process.poll() is None, process.stdout.read()
+        process.kill()
+        process.communicate()
+    assert not row_path(directory, "short").is_file()
+    assert season(directory, entries=entries) == 1
+    assert steady(directory) == steady(whole)
+    assert load_split(directory / "split").digest == load_split(whole / "split").digest
+
+
+def test_anybody_records_the_split_of_published_bits_again(whole, tmp_path):
+    assert season(tmp_path / "again", "--bits", BITS) == 0
+    assert read_season(tmp_path / "again").split == read_season(whole).split
+
+
+def test_other_bits_sizes_or_entries_are_refused(whole, entries, tmp_path, capsys):
+    other = BITS[::-1]
+    assert season(whole, "--bits", other, entries=entries) == 4
+    said = capsys.readouterr().err
+    assert BITS in said
+    assert other in said
+    assert season(whole, "--test", 5, entries=entries) == 4
+    assert "expected 5" in capsys.readouterr().err
+    (tmp_path / "late.toml").write_text('detector = "clock"\n')
+    assert season(whole, entries=tmp_path) == 4
+    assert "late" in capsys.readouterr().err
+
+
+def test_a_changed_row_is_run_again_before_a_season_is_whole(whole, entries, tmp_path):
+    directory, changed = tmp_path / "season", tmp_path / "entries"
+    shutil.copytree(whole, directory)
+    shutil.copytree(entries, changed)
+    write_season(dataclasses.replace(read_season(directory), date=""), directory)
+    kept = row_path(directory, "mewma").stat().st_mtime_ns
+    (changed / "short.toml").write_text('detector = "mewma"\nparameters = {clip = 4.0}\n')
+    (changed / "random.toml").unlink()
+    assert season(directory, entries=changed) == 1
+    assert row_path(directory, "mewma").stat().st_mtime_ns == kept
+    read = read_season(directory)
+    assert {r.overrides["clip"] for r in read.records(directory) if r.detector == "short"} == {4.0}
+    assert not row_path(directory, "random").exists()
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ('detector = "mewmo"\n', "mewmo"),
+        ("parameters = {klip = 2.0}\n", "klip"),
+        ('parameters = {clip = "no"}\n', "clip"),
+        ('wheel = "mine-1-py3-none-any.whl"\nsha256 = "' + "0" * 64 + '"\n', "no such file"),
+    ],
+)
+def test_errors_of_entries_are_told_before_anything_starts(tmp_path, content, message, capsys):
+    (tmp_path / "mewma.toml").write_text(content)
+    assert season(tmp_path / "season", entries=tmp_path) == 4
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "season").exists()
+
+
+def test_without_bubblewrap_nothing_starts(entries, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert season(tmp_path / "season", entries=entries) == 4
+    assert "bubblewrap" in capsys.readouterr().err
+    assert not (tmp_path / "season").exists()
