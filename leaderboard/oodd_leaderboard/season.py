@@ -16,16 +16,19 @@ from typing import Any, Final
 from oodd_eval._version import __version__
 from oodd_eval.data.facts import PROTOCOL, SplitDefinition
 from oodd_eval.data.split import Split, load_split, split_places
-from oodd_eval.errors import PluginError, UsageError
+from oodd_eval.errors import PluginError, UnknownNameError, UsageError
 from oodd_eval.plugins.discovery import Plugins, printable
+from oodd_eval.plugins.installed import normalized
 from oodd_eval.plugins.parameters import resolve_parameters
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.identity import Setting
-from oodd_eval.results.record import Record, gather
+from oodd_eval.results.record import Record, Status, gather
 from oodd_eval.scoring.executors import RunSettings
 from oodd_eval.scoring.plan import Plan, Unit, make_plan
 from oodd_eval.scoring.runner import run
 from oodd_leaderboard.entry import Entry
+from oodd_leaderboard.install import install
+from oodd_leaderboard.sandbox.describe import discover_entry
 from oodd_leaderboard.sandbox.launcher import make_sandbox
 from oodd_leaderboard.season_files import (
     PACKAGES,
@@ -33,6 +36,7 @@ from oodd_leaderboard.season_files import (
     SEASON,
     SPLIT,
     WORK,
+    Installed,
     Season,
     SeasonSplit,
     read_season,
@@ -148,8 +152,9 @@ def check_entries(entries: Sequence[Entry], directory: Path, plugins: Plugins) -
     shipped ones that do not exist.
     """
     for entry in entries:
-        if entry.wheel and not (wheel := directory / entry.name / entry.wheel).is_file():
-            raise UsageError(f"entry {entry.name!r} names the wheel {str(wheel)!r}: no such file")
+        wheels = (directory / entry.name / entry.wheel, directory / entry.wheel)
+        if entry.wheel and not any(path.is_file() for path in wheels):
+            raise UsageError(f"entry {entry.name!r} names the wheel {entry.wheel}: no such file")
         if entry.shipped:
             offer = plugins.offer(entry.detector)
             if offer.distribution != entry.distribution:
@@ -196,26 +201,42 @@ class SeasonRunner:
         `observers` hear of its progress. `SplitError`, `OutputError`: the season cannot go on.
         """
         try:
-            launcher = make_sandbox(self._hidden())
+            packages = () if entry.shipped else (self._installed(entry),)
+        except PluginError as error:
+            return self._kept(entry, self._failed(entry, "unavailable", str(error)))
+        launcher = make_sandbox(self._hidden(), packages)
+        try:
             plugins = self.shipped
+            if packages:
+                plugins = discover_entry(packages[0], launcher, self.settings.limits.memory)
             plan = self._plan(entry, plugins)
         except (PluginError, UsageError) as error:
-            records = self._failed(entry, str(error))
-        else:
-            settings = replace(self.settings, launcher=launcher, streamed=True)
-            results = ResultsDirectory(self.directory / WORK / entry.name)
-            outcome = run(plan, self.split, plugins, settings, results, observers)
-            if outcome.interrupted or outcome.left:
-                return None
-            records = outcome.records
+            return self._kept(entry, self._failed(entry, "error", str(error)))
+        settings = replace(self.settings, launcher=launcher, streamed=True)
+        results = ResultsDirectory(self.directory / WORK / entry.name)
+        outcome = run(plan, self.split, plugins, settings, results, observers)
+        if outcome.interrupted or outcome.left:
+            return None
+        return self._kept(entry, outcome.records)
+
+    def _kept(self, entry: Entry, records: Sequence[Record]) -> list[Record]:
+        """Write the records of a row, which has the name of its entry."""
         # What it is trained on is declared twice, and what is not ranked counts.
         declared = {} if entry.training == "nominal" else {"training": entry.training}
-        records = [replace(record, detector=entry.name, **declared) for record in records]
-        write_row(self.directory, entry.name, records)
-        return records
+        named = [replace(record, detector=entry.name, **declared) for record in records]
+        write_row(self.directory, entry.name, named)
+        return named
 
     def _plan(self, entry: Entry, plugins: Plugins) -> Plan:
-        spec = plugins.offer(entry.detector).spec
+        try:
+            offer = plugins.offer(entry.detector)
+        except UnknownNameError:
+            if not plugins.broken:
+                raise
+            raise PluginError(plugins.broken[0].reason) from None
+        if normalized(offer.distribution) != entry.distribution:
+            raise PluginError(f"it is {offer.distribution} that offers {entry.detector!r}")
+        spec = offer.spec
         return make_plan(
             plugins,
             split=self.split,
@@ -234,7 +255,18 @@ class SeasonRunner:
             *(str(self.directory / part) for part in parts),
         ]
 
-    def _failed(self, entry: Entry, reason: str) -> list[Record]:
+    def _installed(self, entry: Entry) -> Path:
+        """Return the directory that a stranger's entry is installed in, once it is."""
+        target = self.directory / PACKAGES / entry.name
+        if entry.name not in self.season.installed or not target.is_dir():
+            wheels = [Installed(**wheel) for wheel in install(entry, self.entries, target)]
+            self.season = replace(
+                self.season, installed={**self.season.installed, entry.name: wheels}
+            )
+            write_season(self.season, self.directory)
+        return target
+
+    def _failed(self, entry: Entry, status: Status, reason: str) -> list[Record]:
         """Return the records of a row of which no cell could be tried."""
         parameters = dict(entry.parameters)
         units = tuple(
@@ -255,7 +287,7 @@ class SeasonRunner:
         strengths = {e: self.split.strengths(e) for e in self.season.environments}
         plan = Plan(self.split.name, self.split.digest, units, self.split.groups, None, strengths)
         outcome: dict[str, Any] = {
-            "status": "unavailable",
+            "status": status,
             "reason": printable(reason),
             "provenance": gather(self.settings.command),
         }

@@ -3,11 +3,12 @@
 import contextlib
 import json
 import re
+import shutil
 import subprocess
 import sys
 import threading
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from helpers_plugins import install
@@ -18,7 +19,7 @@ from oodd_eval.errors import SplitError, UsageError
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.plugins.isolation.child import Limits
 from oodd_eval.results.directory import ResultsDirectory
-from oodd_eval.scoring.executors import Executor, RunSettings, check_executor, open_executor
+from oodd_eval.scoring.executors import Executor, RunSettings, check_executor
 from oodd_eval.scoring.plan import make_plan
 from oodd_eval.scoring.unit import UnitJob
 
@@ -67,12 +68,6 @@ def test_an_executor_that_does_not_exist_is_refused(name):
         check_executor(name)
 
 
-def test_a_cluster_takes_no_launcher_of_this_machine(tiny_split):
-    settings = RunSettings(executor="dask://h:1", launcher=SimpleNamespace())
-    with pytest.raises(UsageError, match="--sandbox is for workers of this machine"):
-        open_executor(settings, load_split(tiny_split), None)
-
-
 def test_an_order_is_json_and_gives_the_scores_of_a_local_unit(job, tiny_split):
     there = ordered(job, tiny_split)
     here = Executor(RunSettings(jobs=1), None, NEVER)(job)
@@ -80,6 +75,23 @@ def test_an_order_is_json_and_gives_the_scores_of_a_local_unit(job, tiny_split):
     assert {k: [s.tolist() for s in v] for k, v in there["parts"].items()} == {
         k: [s.tolist() for s in v] for k, v in here.file.parts.items()
     }
+
+
+def test_a_sandbox_travels_with_the_order(job, tiny_split):
+    if not shutil.which("bwrap"):
+        pytest.skip("needs bubblewrap")
+    from oodd_leaderboard.sandbox.launcher import make_sandbox
+
+    launcher = make_sandbox([tiny_split])
+    here = Executor(RunSettings(jobs=1), None, NEVER)(job)
+    there = ordered(replace(job, launcher=launcher, streamed=True), tiny_split)
+    assert there["status"] == "ok", there["reason"]
+    assert [s.tolist() for s in there["parts"]["test/iid"]] == [
+        s.tolist() for s in here.file.parts["test/iid"]
+    ]
+    made = remote._launcher(json.dumps(launcher.elsewhere, sort_keys=True), None)[0]
+    assert made.elsewhere == launcher.elsewhere
+    assert made is not launcher
 
 
 def test_limits_travel_with_the_order_and_work_that_nobody_waits_for_is_given_up(job, tiny_split):

@@ -33,6 +33,7 @@ from oodd_eval.plugins.isolation.child import Child, GivenUpError, Launcher, Lim
 from oodd_eval.plugins.isolation.worker import connect
 from oodd_eval.plugins.specs import MOST_SPECS, is_line
 from oodd_leaderboard.sandbox.described_specs import description_of, spec_of
+from oodd_leaderboard.sandbox.launcher import make_sandbox
 from oodd_leaderboard.sandbox.metadata import check_packages
 
 if TYPE_CHECKING:
@@ -68,6 +69,16 @@ def discover_entry(packages: Path, launcher: Launcher, memory: int | None) -> Pl
     if not plugins.points:
         raise PluginError(f"it offers no plug-in: expected an entry point of group {PROJECT}")
     return plugins
+
+
+def sandboxed_plugins(
+    hidden: Sequence[str], packages: Sequence[str], memory: int | None
+) -> tuple[Launcher, Plugins]:
+    """Make a sandbox as `Sandbox.elsewhere` tells of it, and find the plug-ins in it."""
+    launcher = make_sandbox(hidden, packages)
+    if not packages:
+        return launcher, discover_in_sandbox((), launcher, memory)
+    return launcher, discover_entry(Path(packages[0]), launcher, memory)
 
 
 @dataclass(frozen=True, slots=True)

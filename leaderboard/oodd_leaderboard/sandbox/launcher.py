@@ -18,7 +18,7 @@ from contextlib import suppress
 from importlib.metadata import entry_points
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from oodd_eval.errors import UsageError
 
@@ -28,6 +28,7 @@ SCRATCH: Final = "/tmp"  # noqa: S108  of the sandbox, not of the system
 SCRATCH_BYTES: Final = 2 * 10**9  # of /tmp, beside --memory: the training episodes lie there
 SHARED_BYTES: Final = 256 * 10**6  # of /dev/shm
 NOBODY: Final = "65534"
+ELSEWHERE: Final = "oodd_leaderboard.sandbox.describe:sandboxed_plugins"
 PACKAGES: Final = Path("/packages")  # Numbers below it: paths of this machine may tell something.
 
 _ROOT: Final = ("usr", "bin", "sbin", "lib", "lib32", "lib64", "libx32")
@@ -72,6 +73,12 @@ class Sandbox:
             self._mounts[existing] = [*_mounts(readable, existing)], nobody
         mounts, nobody = self._mounts[existing]
         return _bubblewrap(mounts, command, nobody=nobody)
+
+    @property
+    def elsewhere(self) -> dict[str, Any]:
+        """What another machine with the same file system makes an equal one of."""
+        paths = {"hidden": self._hidden, "packages": self._packages.values()}
+        return {"maker": ELSEWHERE} | {name: [*map(str, of)] for name, of in paths.items()}
 
     def environment(self) -> dict[str, str]:
         """Return the variables of a worker: few of the user's, and an empty directory as home."""

@@ -15,10 +15,10 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Any, Final, Protocol
 
 import psutil
 
@@ -69,6 +69,14 @@ class Launcher(Protocol):
     @property
     def packages(self) -> Sequence[str]:
         """Directories of packages there, which a worker appends to its import path."""
+
+    @property
+    def elsewhere(self) -> Mapping[str, Any]:
+        """What another machine makes an equal one of, in values that JSON knows.
+
+        ``maker`` is a function as ``module:name``. With the other ones, and ``memory``, it returns
+        a launcher and the plug-ins there.
+        """
 
     def wrap(self, command: Sequence[str]) -> tuple[list[str], list[int]]:
         """Return the command that runs another one there, and descriptors that it reads."""

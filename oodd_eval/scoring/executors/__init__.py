@@ -21,7 +21,7 @@ class RunSettings:
     """Settings of a run that change no metric.
 
     `jobs` are units at a time (None: one per core, or per thread of a cluster), `limits` those of
-    each worker. A `launcher`, such as a sandbox, starts the workers of this machine. `fresh` fits
+    each worker. A `launcher`, such as a sandbox, starts the workers. `fresh` fits
     again what the results directory has. `executor` is ``"local"`` or ``"dask://HOST:PORT"``. After
     `deadline` seconds nothing new is begun. `command` is the command line, for the provenance of
     records. `streamed` hands a detector one row at a time and waits for its score before the next;
@@ -77,8 +77,6 @@ def open_executor(
     """Return the executor that the settings name."""
     if settings.executor == LOCAL:
         return Executor(settings, results, threading.Event())
-    if settings.launcher:
-        raise UsageError("--sandbox is for workers of this machine, without --executor")
     from oodd_eval.scoring.executors.dask import DaskExecutor  # noqa: PLC0415  an extra
 
     return DaskExecutor(f"tcp://{urlsplit(settings.executor).netloc}", settings, split, results)

@@ -12,9 +12,11 @@ named in the order by digest and compared before any work.
 
 import contextlib
 import functools
+import json
 import threading
 import warnings
 from dataclasses import asdict
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,10 +25,17 @@ from pydantic import TypeAdapter
 from oodd_eval._version import __version__
 from oodd_eval.data.parts import EnvironmentData
 from oodd_eval.data.split import Split, load_split
-from oodd_eval.errors import ExecutorError, MissingExtraError, OoddError, PluginError, SplitError
+from oodd_eval.errors import (
+    ExecutorError,
+    MissingExtraError,
+    OoddError,
+    PluginError,
+    SplitError,
+    UsageError,
+)
 from oodd_eval.plugins.contract import Progress, ignore_progress
-from oodd_eval.plugins.discovery import offer_of
-from oodd_eval.plugins.isolation.child import Limits, Stop
+from oodd_eval.plugins.discovery import Plugins, offer_of
+from oodd_eval.plugins.isolation.child import Launcher, Limits, Stop
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
 from oodd_eval.scoring.executors import Executor, RunSettings
 from oodd_eval.scoring.plan import Plan, Unit, source_digest
@@ -149,6 +158,7 @@ def order_of(job: UnitJob, split: Split, limits: Limits) -> Message:
         },
         "unit": asdict(job.unit),
         "streamed": job.streamed,
+        "launcher": job.launcher and dict(job.launcher.elsewhere),
         "limits": asdict(limits),
     }
 
@@ -183,11 +193,17 @@ def _scored(order: Message, stop: Stop) -> Message:
     # Read also from JSON, which turns tuples into lists.
     unit = TypeAdapter(Unit).validate_python(order["unit"])
     plan = Plan(units=(unit,), **order["plan"])
+    limits, launcher = Limits(**order["limits"]), None
     try:
-        offer = offer_of(unit.plugin, unit.setting.detector)
-    except PluginError as error:
+        if order["launcher"]:
+            made = json.dumps(order["launcher"], sort_keys=True)
+            launcher, plugins = _launcher(made, limits.memory)
+            offer = plugins.offer(unit.setting.detector)
+        else:
+            offer = offer_of(unit.plugin, unit.setting.detector)
+    except (PluginError, UsageError) as error:
         raise ExecutorError(f"on the other side, {error}") from None
-    digests = {"version": offer.version, "source": source_digest(offer.module)}
+    digests = {"version": offer.version, "source": source_digest(offer.module, offer.packages)}
     for name, here in digests.items():
         if here != getattr(unit, name):
             raise ExecutorError(
@@ -197,10 +213,19 @@ def _scored(order: Message, stop: Stop) -> Message:
     data = _environment(
         order["split"]["path"], order["split"]["name"], plan.split_digest, unit.environment
     )
-    job = UnitJob(plan, unit, data, offer, order["streamed"])
-    scored = job(Limits(**order["limits"]), stop, None, fresh=True)
+    job = UnitJob(plan, unit, data, offer, order["streamed"], launcher)
+    scored = job(limits, stop, None, fresh=True)
     outcome = {"status": scored.status, "reason": scored.reason, "log": scored.log}
     return {**outcome, **{name: getattr(scored.file, name) for name in _FILE}}
+
+
+@functools.lru_cache(maxsize=16)
+def _launcher(made: str, memory: int | None) -> tuple[Launcher, Plugins]:
+    """Make a launcher of what `Launcher.elsewhere` tells of it; units share it."""
+    arguments = json.loads(made)
+    module, _, maker = arguments.pop("maker").partition(":")
+    launcher, plugins = getattr(import_module(module), maker)(**arguments, memory=memory)
+    return launcher, plugins
 
 
 @functools.lru_cache(maxsize=16)
