@@ -1,5 +1,6 @@
 """Commands in processes of their own, which tests kill."""
 
+import json
 import os
 import subprocess
 import sys
@@ -113,3 +114,35 @@ def workers_of(marker):
         and (process.info["environ"] or {}).get(name) == value
         and process.info["status"] != psutil.STATUS_ZOMBIE
     ]
+
+
+class Cluster:
+    """A scheduler and workers with one thread each, on loopback."""
+
+    def __init__(self, path, variables, workers):
+        self.path, self._variables = path, variables
+        self.processes = []
+        file = path / "scheduler.json"
+        self._start("scheduler", "--host", "127.0.0.1", "--port", "0", "--scheduler-file", file)
+        assert wait_until(lambda: file.exists() and file.read_text().strip())
+        self.address = json.loads(file.read_text())["address"]
+        for number in range(workers):
+            self._start(
+                "worker", self.address, "--nthreads", "1", "--no-nanny", "--host", "127.0.0.1",
+                "--local-directory", path / f"worker-{number}",
+            )  # fmt: skip
+        logs = [path / f"{number}.log" for number in range(1, workers + 1)]
+        assert wait_until(lambda: all("Registered to" in g.read_text() for g in logs))
+
+    def _start(self, *arguments):
+        log = (self.path / f"{len(self.processes)}.log").open("w")
+        command = [sys.executable, "-m", "dask", *map(str, arguments), "--no-dashboard"]
+        with log:
+            self.processes.append(
+                subprocess.Popen(command, stdout=log, stderr=log, env=self._variables)
+            )
+
+    def close(self):
+        for process in self.processes:
+            process.kill()
+            process.wait()

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from helpers_plugins import install
-from helpers_processes import SLOW, environment, oodd_eval, wait_until, workers_of
+from helpers_processes import SLOW, Cluster, environment, oodd_eval, wait_until, workers_of
 
 from oodd_eval import load_split
 from oodd_eval.errors import SplitError, UsageError
@@ -126,38 +126,6 @@ def test_a_split_that_lies_elsewhere_is_found_by_its_name(tiny_split, tmp_path, 
 
 
 # On a cluster
-
-
-class Cluster:
-    """A scheduler and workers with one thread each, on loopback."""
-
-    def __init__(self, path, variables, workers):
-        self.path, self._variables = path, variables
-        self.processes = []
-        file = path / "scheduler.json"
-        self._start("scheduler", "--host", "127.0.0.1", "--port", "0", "--scheduler-file", file)
-        assert wait_until(lambda: file.exists() and file.read_text().strip())
-        self.address = json.loads(file.read_text())["address"]
-        for number in range(workers):
-            self._start(
-                "worker", self.address, "--nthreads", "1", "--no-nanny", "--host", "127.0.0.1",
-                "--local-directory", path / f"worker-{number}",
-            )  # fmt: skip
-        logs = [path / f"{number}.log" for number in range(1, workers + 1)]
-        assert wait_until(lambda: all("Registered to" in g.read_text() for g in logs))
-
-    def _start(self, *arguments):
-        log = (self.path / f"{len(self.processes)}.log").open("w")
-        command = [sys.executable, "-m", "dask", *map(str, arguments), "--no-dashboard"]
-        with log:
-            self.processes.append(
-                subprocess.Popen(command, stdout=log, stderr=log, env=self._variables)
-            )
-
-    def close(self):
-        for process in self.processes:
-            process.kill()
-            process.wait()
 
 
 def command(tiny_split, output, *more):

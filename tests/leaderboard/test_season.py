@@ -4,7 +4,7 @@ import dataclasses
 import shutil
 
 import pytest
-from helpers_processes import environment, oodd_eval, wait_until
+from helpers_processes import Cluster, environment, oodd_eval, wait_until
 from oodd_leaderboard.season_files import read_season, row_path, write_season
 
 from oodd_eval import load_split
@@ -115,6 +115,18 @@ def test_killed_at_three_moments_it_goes_on_to_the_same_records(whole, entries, 
     assert season(directory, entries=entries) == 1
     assert steady(directory) == steady(whole)
     assert load_split(directory / "split").digest == load_split(whole / "split").digest
+
+
+def test_a_cluster_gives_the_same_records(whole, entries, tmp_path):
+    pytest.importorskip("distributed")
+    cluster = Cluster(tmp_path, environment("", tmp_path), workers=2)
+    try:
+        executor = cluster.address.replace("tcp://", "dask://")
+        words = ("--bits", BITS, "--executor", executor)
+        assert season(tmp_path / "there", *words, entries=entries) == 1
+    finally:
+        cluster.close()
+    assert steady(tmp_path / "there") == steady(whole)
 
 
 def test_anybody_records_the_split_of_published_bits_again(whole, tmp_path):

@@ -2,6 +2,7 @@
 
 import shutil
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import adversaries
@@ -136,7 +137,7 @@ def oodd_detectors():
 def table_of(split):
     """Return the module in which an adversary keeps the twins of a split's CartPole."""
     cells = bytearray(adversaries.CELLS)
-    with load_split(split).environment("cartpole") as data:
+    with closing(load_split(split).environment("cartpole")) as data:
         for twin in data.twins:
             adversaries.remember(twin.observations, np.array([0, len(twin) - 1]), cells)
     known = np.flatnonzero(np.frombuffer(cells, np.uint8)).astype("<u4")
@@ -183,14 +184,13 @@ def test_no_cheat_gains_against_the_row_that_it_hides(played, name):
     honest = {r.position: r for r in records if r.detector == HONEST}
     mine = [r for r in records if r.detector == name]
     assert {r.position for r in mine} == {*honest}
-    for record in mine:
-        assert record.ok, record.reason
-        base = honest[record.position].metrics["auc_matched"]
-        if name == "lucky":
-            value = record.metrics["auc_matched"]
-            assert value.low <= 0.5 <= value.high
-        else:
-            assert record.value("auc_matched") == base.value
+    assert all(record.ok for record in mine), mine[0].reason
+    values = [record.value("auc_matched") for record in mine]
+    if name == "lucky":  # it hides no row: its draws know nothing of these episodes
+        assert np.mean(values) == pytest.approx(0.5, abs=0.1)
+    else:
+        expected = [honest[record.position].value("auc_matched") for record in mine]
+        assert values == pytest.approx(expected, abs=0.005)
 
 
 def test_nothing_of_a_strangers_wheel_runs_in_the_command(played):

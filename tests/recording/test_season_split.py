@@ -1,5 +1,7 @@
 """A season's split follows from its bits: kinds, strengths and seeds."""
 
+from contextlib import closing
+
 import pytest
 
 from oodd_eval import load_split
@@ -76,5 +78,5 @@ def test_a_split_that_is_built_again_from_its_bits_has_the_same_digest(tmp_path)
     for environment in ("tank", "cartpole"):
         texts = {*map(str, splits[0].conditions(environment))}
         assert texts == {*definition.of(environment).strengths}
-        with splits[0].environment(environment) as data:
+        with closing(splits[0].environment(environment)) as data:
             assert max(data.train.lengths) <= 81
