@@ -257,7 +257,7 @@ class SeasonRunner:
 
     def _installed(self, entry: Entry) -> Path:
         """Return the directory that a stranger's entry is installed in, once it is."""
-        target = self.directory / PACKAGES / entry.name
+        target = (self.directory / PACKAGES / entry.name).absolute()
         if entry.name not in self.season.installed or not target.is_dir():
             wheels = [Installed(**wheel) for wheel in install(entry, self.entries, target)]
             self.season = replace(

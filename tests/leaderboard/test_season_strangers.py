@@ -96,7 +96,7 @@ CHEATS = {
 }
 SIZES = ("--env", "cartpole,tank", "--train", 4, "--calibration", 20, "--test", 4, "--cap", 80)
 
-RUNS = "open({marker!r}, 'a').write(__name__ + '\\n')\n"
+RUNS = "import os; os.path.isdir({home!r}) and open({home!r} + '/ran', 'a').write('ran')\n"
 
 MORE = """
 from oodd_eval.plugins.parameters import declared_by
@@ -122,8 +122,6 @@ def oodd_detectors():
 """
 
 NEAR = """
-from oodd_sly import Honest as Copied
-
 class Near(Honest):
     def bent(self, row, score):
         return score * (1 + 1e-9)
@@ -149,7 +147,7 @@ def played(tmp_path_factory):
     """The season of an honest row and of cheats that hide it, and a file that nothing writes."""
     home = tmp_path_factory.mktemp("cheats")
     marker = home / "ran"
-    runs = RUNS.format(marker=str(marker))
+    runs = RUNS.format(home=str(home))
     source = Path(adversaries.__file__).read_text()
     files = {
         "oodd_sly.py": runs + source + MORE,
@@ -158,7 +156,7 @@ def played(tmp_path_factory):
         "sitecustomize.py": runs,
         "usercustomize.py": runs,
         "secrets.py": f"{runs}randbits = lambda n: 0\n",
-        "sly.pth": f"import os; {runs}",
+        "sly.pth": runs,
     }
     wheel = write_wheel(home, "oodd-sly", files, plugin="sly", module="oodd_sly")
     entries = home / "entries"
@@ -166,9 +164,7 @@ def played(tmp_path_factory):
     for name, detector in CHEATS.items():
         lines = [f'detector = "{detector}"', "variant = true"]
         write_entry(entries, name, wheel, *lines)
-    near = source.partition("@hookimpl")[0] + NEAR.replace(
-        "from oodd_sly import Honest as Copied\n", ""
-    )
+    near = source.partition("@hookimpl")[0] + NEAR
     copy = write_wheel(home, "oodd-near", {"oodd_near.py": near}, plugin="near", module="oodd_near")
     write_entry(entries, "near", copy)
     # Records of its author's own, which a season does not read.
