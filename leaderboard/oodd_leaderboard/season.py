@@ -8,6 +8,7 @@ its row; the others go on.
 import json
 import shutil
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,8 +17,8 @@ from typing import Any, Final
 from oodd_eval._version import __version__
 from oodd_eval.data.facts import PROTOCOL, SplitDefinition
 from oodd_eval.data.split import Split, load_split, split_places
-from oodd_eval.errors import PluginError, UnknownNameError, UsageError
-from oodd_eval.plugins.discovery import Plugins, printable
+from oodd_eval.errors import MissingExtraError, PluginError, UnknownNameError, UsageError
+from oodd_eval.plugins.discovery import Offer, Plugins, printable
 from oodd_eval.plugins.installed import normalized
 from oodd_eval.plugins.parameters import resolve_parameters
 from oodd_eval.results.directory import ResultsDirectory
@@ -156,15 +157,19 @@ def check_entries(entries: Sequence[Entry], directory: Path, plugins: Plugins) -
         if entry.wheel and not any(path.is_file() for path in wheels):
             raise UsageError(f"entry {entry.name!r} names the wheel {entry.wheel}: no such file")
         if entry.shipped:
-            offer = plugins.offer(entry.detector)
-            if offer.distribution != entry.distribution:
-                raise UsageError(
-                    f"entry {entry.name!r} names the detector {entry.detector!r} of "
-                    f"{offer.distribution}, expected a row that oodd-eval ships, or what is to be "
-                    "installed: a requirement or a wheel"
-                )
-            declared, others = offer.spec.parameters, offer.spec.other_parameters
-            resolve_parameters(entry.detector, declared, entry.parameters, others=others)
+            with suppress(PluginError, MissingExtraError):  # a reason of the row
+                _check_shipped(entry, plugins.offer(entry.detector))
+
+
+def _check_shipped(entry: Entry, offer: Offer) -> None:
+    if offer.distribution != entry.distribution:
+        raise UsageError(
+            f"entry {entry.name!r} names the detector {entry.detector!r} of {offer.distribution}, "
+            "expected a row that oodd-eval ships, or what is to be installed: a requirement or a "
+            "wheel"
+        )
+    declared, others = offer.spec.parameters, offer.spec.other_parameters
+    resolve_parameters(entry.detector, declared, entry.parameters, others=others)
 
 
 @dataclass(slots=True)
@@ -210,7 +215,7 @@ class SeasonRunner:
             if packages:
                 plugins = discover_entry(packages[0], launcher, self.settings.limits.memory)
             plan = self._plan(entry, plugins)
-        except (PluginError, UsageError) as error:
+        except (PluginError, MissingExtraError, UsageError) as error:
             return self._kept(entry, self._failed(entry, "error", str(error)))
         settings = replace(self.settings, launcher=launcher, streamed=True)
         results = ResultsDirectory(self.directory / WORK / entry.name)

@@ -48,7 +48,7 @@ FAILING = {
     "crash": (offer("crash", "def fit(self, nominal): os._exit(7)"), {}, "error", "7"),
     "lacks": (offer("lacks", facts="requires=('no_such_module',)"), {}, "unavailable",
               "no_such_module"),
-    "refused": (offer("refused"), {}, "error", "width"),
+    "seeded": (offer("seeded"), {}, "error", "seed"),
 }  # fmt: skip
 
 
@@ -57,7 +57,7 @@ def failed(tmp_path_factory):
     """Records of a small season by entry."""
     home = tmp_path_factory.mktemp("failing")
     for name, (code, settings, *_) in FAILING.items():
-        lines = ["parameters = {width = 3}"] if name == "refused" else []
+        lines = ["parameters = {seed = 17}"] if name == "seeded" else []
         write_plugin_entry(home / "entries", name, code, *lines, **settings)
     write_plugin_entry(home / "entries", "sound", offer("sound"))
     (home / "entries" / "clock.toml").write_text("")
@@ -94,31 +94,20 @@ CHEATS = {
     "globals": "sly-company-module",
     "lucky": "sly-lucky",
 }
-SIZES = ("--env", "cartpole,tank", "--train", 4, "--calibration", 20, "--test", 4, "--cap", 80)
+SIZES = ("--env", "cartpole,tank", "--train", 3, "--calibration", 8, "--test", 4, "--cap", 60)
 
 RUNS = "import os; os.path.isdir({home!r}) and open({home!r} + '/ran', 'a').write('ran')\n"
 
 MORE = """
-from oodd_eval.plugins.parameters import declared_by
-
 class Lucky(Honest):
     '''The seed that was best of thirty on episodes of its author's.'''
-    def __init__(self, *, seed=0, horizon=1, luck=17):
-        self.luck = luck
-        super().__init__(seed=seed, horizon=horizon)
     def reset(self):
         super().reset()
-        self.draws_ = np.random.default_rng(self.luck)
+        self.draws_ = np.random.default_rng(17)
     def bent(self, row, score):
         return self.draws_.normal()
 
-_detectors = oodd_detectors
-
-@hookimpl
-def oodd_detectors():
-    lucky = DetectorSpec("sly-lucky", Lucky, "", parameters=declared_by({"luck": 17}),
-                         deterministic=True)
-    return [*_detectors(), lucky]
+ADVERSARIES["sly-lucky"] = Lucky
 """
 
 NEAR = """
