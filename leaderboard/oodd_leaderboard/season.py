@@ -80,6 +80,9 @@ def begin(
     )
     if (directory / SEASON).is_file():
         earlier = read_season(directory)
+        if not entries:  # only its split is recorded again
+            rows = dict(earlier.entries)
+            season = replace(season, entries=rows)
         _check_same(earlier, season, directory)
         for name, entry in earlier.entries.items():
             if rows.get(name) != entry:

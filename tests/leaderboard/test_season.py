@@ -132,6 +132,10 @@ def test_a_cluster_gives_the_same_records(whole, entries, tmp_path):
 def test_anybody_records_the_split_of_published_bits_again(whole, tmp_path):
     assert season(tmp_path / "again", "--bits", BITS) == 0
     assert read_season(tmp_path / "again").split == read_season(whole).split
+    shutil.copytree(whole, tmp_path / "published", ignore=lambda *_: ["split", "work", "packages"])
+    assert season(tmp_path / "published") == 0
+    assert read_season(tmp_path / "published") == read_season(whole)
+    assert steady(tmp_path / "published") == steady(whole)
 
 
 def test_other_bits_sizes_or_entries_are_refused(whole, entries, tmp_path, capsys):
