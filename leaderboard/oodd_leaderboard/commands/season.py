@@ -15,6 +15,7 @@ from rich.console import Console
 from oodd_eval.cli import (
     COUNT,
     DIRECTORY,
+    OUTPUT_DIRECTORY,
     Converted,
     Names,
     Options,
@@ -67,7 +68,9 @@ def _bits(text: str) -> int:
 @click.option("--executor", default="local", help="local, or dask://HOST:PORT, a Dask cluster")
 @jobs_option
 @limit_options("a fit with its scores", "1h")
-@click.option("--output", default="oodd-season", type=DIRECTORY, help="directory of the season")
+@click.option(
+    "--output", default="oodd-season", type=OUTPUT_DIRECTORY, help="directory of the season"
+)
 def season(options: Options) -> int:
     """Run a season: each entry in each environment, with the same seeds, in sandboxes.
 

@@ -196,8 +196,8 @@ def _scored(order: Message, stop: Stop) -> Message:
     limits, launcher = Limits(**order["limits"]), None
     try:
         if order["launcher"]:
-            made = json.dumps(order["launcher"], sort_keys=True)
-            launcher, plugins = _launcher(made, limits.memory)
+            text = json.dumps(order["launcher"], sort_keys=True)
+            launcher, plugins = _launcher(text, limits.memory)
             offer = plugins.offer(unit.setting.detector)
         else:
             offer = offer_of(unit.plugin, unit.setting.detector)
@@ -220,9 +220,9 @@ def _scored(order: Message, stop: Stop) -> Message:
 
 
 @functools.lru_cache(maxsize=16)
-def _launcher(made: str, memory: int | None) -> tuple[Launcher, Plugins]:
+def _launcher(text: str, memory: int | None) -> tuple[Launcher, Plugins]:
     """Make a launcher of what `Launcher.elsewhere` tells of it; units share it."""
-    arguments = json.loads(made)
+    arguments = json.loads(text)
     module, _, maker = arguments.pop("maker").partition(":")
     launcher, plugins = getattr(import_module(module), maker)(**arguments, memory=memory)
     return launcher, plugins
