@@ -230,7 +230,9 @@ class SeasonRunner:
     def _kept(self, entry: Entry, records: Sequence[Record]) -> list[Record]:
         """Write the records of a row, which has the name of its entry."""
         # What it is trained on is declared twice, and what is not ranked counts.
-        declared = {} if entry.training == "nominal" else {"training": entry.training}
+        declared: dict[str, Any] = {}
+        if entry.training != "nominal":
+            declared["training"] = entry.training
         named = [replace(record, detector=entry.name, **declared) for record in records]
         write_row(self.directory, entry.name, named)
         return named
