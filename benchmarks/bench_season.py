@@ -1,127 +1,77 @@
-"""Hours that a season takes, from the seconds of a trial season.
+"""Hours that a season takes on a machine as busy as the one where the reported rows were computed.
 
-``python benchmarks/bench_season.py TRIAL [--entries DIR] [--fits RESULTS] [--cores 2]`` reads the
-records of a trial season, which may be of few rows, one environment and few episodes, and prints
-for each row the seconds of a fit, the microseconds that its detector takes for a row of an episode,
-and the hours of a core for a season of ten environments. Fits whose updates a trial has cut short
-are taken from other results of the same detectors (``--fits``, a directory of results directories).
-Rows of `--entries` that were not measured count as the mean of the others. What a process in
-a sandbox takes to start, with the imports of the detector, and a row to be sent, is measured here.
+``python -P benchmarks/bench_season.py [--row 690] [--start 1.5] [--cores 2]`` counts fits and
+streamed rows of a season of all committed entries in ten environments. Seconds of fits are those of
+the reported records on split mini, longer by the ratio of training episodes; of detectors without
+any they are the mean of the others. Microseconds of a streamed row and seconds of a fresh sandbox
+are what ``bench_isolation.py --rows`` prints, by default the means of its table.
 """
 
 import argparse
-import subprocess
-import sys
-import time
 from pathlib import Path
 from statistics import fmean
 
-HERE = str(Path(__file__).parent)
-sys.path[:] = [path for path in sys.path if path != HERE]  # it has libraries' names
+from oodd_leaderboard.entry import read_entries
+from oodd_leaderboard.season import SEEDS
+from oodd_recording.season import KINDS, SEASON_ENVIRONMENTS, SeasonSizes
 
-from oodd_leaderboard.entry import read_entries  # noqa: E402
-from oodd_leaderboard.sandbox.launcher import make_sandbox  # noqa: E402
-from oodd_leaderboard.season import SEEDS  # noqa: E402
-from oodd_leaderboard.season_files import SPLIT, read_season  # noqa: E402
-from oodd_recording.season import KINDS, SEASON_ENVIRONMENTS, SeasonSizes  # noqa: E402
+from oodd_eval import load_split
+from oodd_eval.data.facts import ENVIRONMENTS
+from oodd_eval.data.files import find_file
+from oodd_eval.plugins.discovery import discover
+from oodd_eval.results.directory import RECORDS, read_records
 
-from oodd_eval import load_split  # noqa: E402
-from oodd_eval.data.files import find_file  # noqa: E402
-from oodd_eval.plugins.discovery import discover  # noqa: E402
-from oodd_eval.results.directory import RECORDS, read_records  # noqa: E402
-from oodd_eval.scoring.executors import RunSettings  # noqa: E402
-from oodd_eval.scoring.plan import make_plan  # noqa: E402
-from oodd_eval.scoring.runner import run  # noqa: E402
-
-GROUPS = 2 * KINDS + 2  # of a unit: the test parts, the twins, and the fit
-TRIES = 3
+LEADERBOARD = Path(__file__).parents[1] / "leaderboard"
+SANDBOXES = 2 * KINDS + 2  # of a unit: test parts, twins among them, and the fit
+WORLDS_ROWS = 401.0
 
 
-def rows_of_unit(directory, sizes):
-    """Return the rows of episodes that a unit of a season scores, by the lengths of the trial's."""
-    split, rows = load_split(directory / SPLIT), []
-    for environment in split.environments:
-        groups = split.manifest["environments"][environment]["groups"]
-        lengths = {
-            name: 1 + group["transitions"] / group["trajectories"] for name, group in groups.items()
-        }
-        tests = [length for name, length in lengths.items() if name.startswith("test/")]
-        rows.append(sizes.calibration * lengths["calibration"] + sizes.test * sum(tests))
-    return fmean(rows)
+def rows_of_episode(environment):
+    """Return the rows of a test episode, by those of mini, which has the same cap."""
+    if environment not in ENVIRONMENTS:
+        return WORLDS_ROWS
+    groups = load_split("mini").manifest["environments"][environment]["groups"]
+    tests = [group for name, group in groups.items() if name.startswith("test/")]
+    return 1 + sum(g["transitions"] for g in tests) / sum(g["trajectories"] for g in tests)
 
 
-def seconds_of_start(modules):
-    """Return the seconds of a process in a sandbox that imports what a worker does, the least."""
-    sandbox, taken = make_sandbox(), []
-    code = "".join(f"import {name}\n" for name in ("oodd_eval.plugins.isolation.worker", *modules))
-    for _ in range(TRIES):
-        start = time.perf_counter()
-        command, descriptors = sandbox.wrap([sys.executable, "-I", "-c", code])
-        subprocess.run(command, pass_fds=descriptors, env=sandbox.environment(), check=True)
-        taken.append(time.perf_counter() - start)
-    return min(taken)
-
-
-def seconds_of_message(directory, start):
-    """Return the seconds of a row that is sent to a sandbox and whose score comes back."""
-    split, plugins = load_split(directory / SPLIT), discover()
-    environments = split.environments[:1]
-    plan = make_plan(plugins, split=split, detectors=["clock"], environments=environments)
-    settings = RunSettings(jobs=1, streamed=True, launcher=make_sandbox())
-    begun = time.perf_counter()
-    (record, *more) = run(plan, split, plugins, settings).records
-    groups = len(more) + 3  # the test parts, the twins, and the fit
-    return max(time.perf_counter() - begun - groups * start, 0.0) / record.steps_scored
-
-
-def fits_of(results):
-    """Return the mean seconds of a fit by detector in a directory of results directories."""
+def seconds_of_fits():
+    """Return the mean seconds of a fit on mini by detector, with its default parameters."""
     seconds = {}
-    for directory in sorted(results.glob("*/")):
+    for directory in sorted((LEADERBOARD / "results").glob("*-mini/")):
         file = find_file(directory / RECORDS)
         for record in read_records(file) if file else ():
-            if record.ok and not record.overrides and record.split == "mini":
+            if record.ok and not record.overrides and record.horizon == 1:
                 seconds.setdefault(record.detector, []).append(record.seconds_fit)
     return {name: fmean(values) for name, values in seconds.items()}
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("trial", type=Path)
-    parser.add_argument("--entries", type=Path, default=Path("leaderboard/entries"))
-    parser.add_argument("--fits", type=Path)
+    parser.add_argument("--row", type=float, default=690.0, help="microseconds")
+    parser.add_argument("--start", type=float, default=1.5, help="seconds")
     parser.add_argument("--cores", type=int, default=2)
     options = parser.parse_args()
-    season, plugins, sizes = read_season(options.trial), discover(), SeasonSizes()
-    records = [r for r in season.records(options.trial) if r.ok]
-    long_fits = fits_of(options.fits) if options.fits else {}
-    rows, starts, hours = rows_of_unit(options.trial, sizes), {}, {}
-    starts[()] = seconds_of_start(())
-    message = seconds_of_message(options.trial, starts[()])
-    print(f"a row sent and scored in nothing: {1e6 * message:.0f} us")
-    print(f"{'row':14} {'s a fit':>8} {'us a row':>9} {'s a start':>9} {'fits':>5} {'hours':>6}")
-    for name, entry in season.entries.items():
-        mine = [r for r in records if r.detector == name]
-        if not (entry.shipped and mine):
-            continue
-        requires = plugins.offer(entry.detector).spec.requires
-        if requires not in starts:
-            starts[requires] = seconds_of_start(requires)
-        trained = sizes.train / season.split.definition["train"]
-        fit = max(fmean(r.seconds_fit for r in mine) * trained, long_fits.get(entry.detector, 0))
-        row = sum(r.seconds_score for r in mine) / sum(r.steps_scored for r in mine)
-        seeds = 1 if mine[0].deterministic else len(SEEDS)
-        units = seeds * len(SEASON_ENVIRONMENTS)
-        hours[name] = units * (fit + rows * (row + message) + GROUPS * starts[requires]) / 3600
-        cells = f"{fit:8.1f} {1e6 * row:9.0f} {starts[requires]:9.2f} {units:5d}"
-        print(f"{name:14} {cells} {hours[name]:6.2f}")
-    offers = {e.name: plugins.offer(e.detector).spec for e in read_entries(options.entries)}
-    units = sum((1 if s.deterministic else len(SEEDS)) for s in offers.values())
-    units *= len(SEASON_ENVIRONMENTS)
-    whole = sum(hours.values()) + fmean(hours.values()) * len({*offers} - {*hours})
+    sizes, plugins, fits = SeasonSizes(), discover(), seconds_of_fits()
+    episodes = sizes.calibration + sizes.test * (1 + 2 * KINDS)
+    rows = episodes * fmean(map(rows_of_episode, SEASON_ENVIRONMENTS))
+    specs = [plugins.offer(e.detector).spec for e in read_entries(LEADERBOARD / "entries")]
+    units = [(1 if s.deterministic else len(SEEDS)) * len(SEASON_ENVIRONMENTS) for s in specs]
+    usual = fmean(fits.values())
+    longer = sizes.train / load_split("mini").manifest["definition"]["train"]
+    seconds = {
+        "fits": sum(
+            n * fits.get(spec.name, usual) * longer for spec, n in zip(specs, units, strict=True)
+        ),
+        "rows": sum(units) * rows * options.row / 1e6,
+        "sandboxes": sum(units) * SANDBOXES * options.start,
+    }
+    total = sum(seconds.values()) / 3600
+    print(f"{len(specs)} rows, {sum(units)} fits, {rows:.0f} streamed rows of each")
+    print(", ".join(f"{name} {value / 3600:.1f} h" for name, value in seconds.items()))
+    rate = sum(units) * rows / seconds["rows"]
     print(
-        f"{len(offers)} rows, {units} fits, {units * rows / 1e6:.0f} million streamed rows: about "
-        f"{whole:.1f} hours of a core, {whole / options.cores:.1f} on {options.cores}"
+        f"{rate:.0f} rows a second and core; {total:.1f} h of a core, {total / options.cores:.1f} h"
     )
 
 
