@@ -96,7 +96,7 @@ def make_sandbox(hidden: Iterable[str | Path] = (), packages: Iterable[str | Pat
     code, error = _run(command, descriptors, sandbox.environment())
     if code:
         raise UsageError(
-            f"--sandbox: bubblewrap cannot make a sandbox here: {error.strip()[-300:]}; "
+            f"bubblewrap cannot make a sandbox here: {error.strip()[-300:]}; "
             "user namespaces have to be allowed, and oodd-eval has to be installed"
         )
     return sandbox
@@ -207,7 +207,7 @@ def _masked(path: str, *, directory: bool) -> tuple[str, ...]:
 
 def _program() -> str:
     if not (program := shutil.which("bwrap")):
-        raise UsageError("--sandbox needs bubblewrap, the program bwrap (on Linux): install it")
+        raise UsageError("a sandbox needs bubblewrap, the program bwrap (on Linux): install it")
     return program
 
 
