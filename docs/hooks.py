@@ -16,8 +16,7 @@ import click
 from figures import environments
 from latex2mathml.converter import convert
 from oodd_leaderboard import site
-from oodd_leaderboard.pages import CELLS, cells
-from oodd_leaderboard.reported import read_entries, sections, suite_sections
+from oodd_leaderboard.pages import CELLS, cells, read_leaderboard
 from properdocs.config.defaults import ProperDocsConfig
 from properdocs.structure import StructureItem
 from properdocs.structure.files import File, Files
@@ -169,12 +168,12 @@ def board() -> dict[str, str | bytes]:
     """Return the files of the leaderboard's site, which are not committed."""
     if not (ROOT / RESULTS[0]).exists():
         return {}
-    found = sections(read_entries(ROOT / "leaderboard" / "results"))
-    suites = suite_sections(ROOT / "leaderboard")
-    shown = site.files(found, suites, project=repository())
+    board = read_leaderboard(ROOT / "leaderboard")
+    links = site.links(ROOT / "leaderboard")
+    shown = site.files(board.reported, board.suites, board.seasons, links=links)
     # The page of Markdown that it links to is a page of this site.
     page = shown[site.PAGE].replace('href="../README.md"', 'href="../index.html"')
-    files = {**shown, site.PAGE: page, Path(CELLS).name: cells(found, suites)}
+    files = {**shown, site.PAGE: page, Path(CELLS).name: cells(board)}
     return {f"{BOARD}/{name}": content for name, content in files.items()}
 
 

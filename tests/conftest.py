@@ -84,11 +84,3 @@ def wheel(tmp_path_factory):
     from helpers_wheel import build_wheel
 
     return build_wheel(tmp_path_factory.mktemp("wheel"))
-
-
-@pytest.fixture(scope="session")
-def submissions(tmp_path_factory):
-    """Valid entries of the leaderboard with their results and split; see `Submissions`."""
-    from helpers_submission import make_submissions
-
-    return make_submissions(tmp_path_factory.mktemp("submissions"))

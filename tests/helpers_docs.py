@@ -40,6 +40,7 @@ NOT_RUN = [
     Rule(r"^\. \.venv/bin/activate$", "the environment is this one; test_walk makes another"),
     Rule(r"^git ", "changes a repository"),
     Rule(r"^podman |^python -m build --wheel$", "needs the image of a registry"),
+    Rule(r"^pip wheel ", "needs a build; test_walk makes one"),
     Rule(
         r"^(export|pip download|python -m zipfile) |^pip install -e examples/oodd-go1",
         "gets a robot that others published",
@@ -58,16 +59,14 @@ NOT_RUN = [
 """Commands that no test of this module runs."""
 
 PARSED_ONLY = [
+    Rule(r"^oodd-eval leaderboard season\b", "minutes, or a night; test_season runs small ones"),
     Rule(r"^oodd-eval compare RESULTS\b", "needs results on files that others published"),
-    Rule(r"leaderboard verify --changed-against", "needs a repository; test_changes makes one"),
     Rule(r"^oodd-eval data build (standard|paper|reduced)\b", "hours of simulation"),
     Rule(r"^oodd-eval data (build ladder|calibrate)\b", "minutes of simulation; test_ladder"),
     Rule(r"--split ladder\b", "takes minutes to build; test_ladder runs over a small one"),
     Rule(r"^oodd-eval data fetch https?:", "needs a network; test_transfer serves one"),
     Rule(r"^oodd-eval reproduce .*--render-only", "renders what hours computed; "
          "test_reproduce_run renders what minutes did"),
-    Rule(r"leaderboard submit reproduction\b", "submits what hours computed; "
-         "test_submission_reproduction submits what minutes did"),
     Rule(r"^oodd-eval data (inspect|import) (g1|bags|mug)\b",
          "needs a data set of LeRobot, or a bag; tests of the readers write both"),
     Rule(r"^oodd-eval data import plant --env pump ", "test_import imports such parts"),

@@ -253,8 +253,8 @@ class Ground:
         common = ("--env", "cartpole", "--split", "split")
         self._do("run", "-q", "--detector", "persistence,random", *common, "--output", "results")
         self._do(
-            "leaderboard", "submit", "results", "--results", "board/results", "--id", "mine",
-            "--split", "split",
+            "leaderboard", "submit", "results", "--detector", "persistence", "--entries",
+            "board/entries", "--name", "mine",
         )  # fmt: skip
         (home / "config.toml").write_text(
             'detector = "persistence"\nenv = "cartpole"\nanomaly = ["iid"]\nsplit = "split"\n'
@@ -323,24 +323,21 @@ READERS = {
     ],
     "results/records.jsonl": [
         ("show", "results"),
-        ("compare", "results", "--against", "board/results/mine"),
+        ("compare", "results", "--against", "board/entries/mine"),
         ("forget", "results", "-k", "iid"),
         ("leaderboard", "place", "results"),
-        ("leaderboard", "submit", "results", "--results", "new", "--split", "split"),
+        ("leaderboard", "submit", "results", "--detector", "persistence", "--entries", "new"),
         ("run", "--detector", "clock", "--env", "cartpole", "--split", "split", "--anomaly", "iid",
          "--output", "results"),
     ],
-    "board/results/mine/records.jsonl": [
-        ("leaderboard", "verify", "board/results/mine"),
-        ("leaderboard", "build", "board/results", "--output", "built"),
+    "board/entries/mine/records.jsonl": [
+        ("leaderboard", "build", "board", "--output", "built"),
     ],
-    "board/results/mine/entry.json": [
-        ("leaderboard", "verify", "board/results"),
-        ("leaderboard", "build", "board/results", "--output", "built"),
+    "board/entries/mine/entry.toml": [
+        ("leaderboard", "build", "board", "--output", "built"),
     ],
-    "board/results/mine/curves.json": [
-        ("leaderboard", "verify", "board/results/mine"),
-        ("leaderboard", "build", "board/results", "--output", "built"),
+    "board/entries/mine/curves.json": [
+        ("leaderboard", "build", "board", "--output", "built"),
     ],
     "logs/recipe.toml": [
         ("data", "import", "logs/recipe.toml", "--output", "imported"),
@@ -712,7 +709,7 @@ oodd_detector_from_spec.__doc__ = {STEERING!r}
 oodd_detector_from_spec = hookimpl(oodd_detector_from_spec)
 """
 _SUMMARY = f"@hookimpl\ndef oodd_detectors(): return [DetectorSpec('a', Good, {STEERING!r})]"
-_SUBMIT = ("leaderboard", "submit", "results", "--results", "new", "--split", "split")
+_SUBMIT = ("leaderboard", "submit", "results", "--detector", "persistence", "--entries", "new")
 _ROWS = "logs/train/run-0.csv"
 TERMINAL = [
     Case(f"terminal: {name}: {' '.join(arguments[:2])!a}", prepare, arguments, plugins=plugins)
@@ -731,7 +728,7 @@ TERMINAL = [
                 ("info", STEERING), (f"--{STEERING}",), (STEERING,), ("show", STEERING),
                 ("run", "--detector", STEERING, "--env", "ant"), ("data", "inspect", STEERING),
                 (*_ONE_CELL, "-k", f"iid and {STEERING}"), ("data", "fetch", f"http://{STEERING}"),
-                (*_SUBMIT, "--title", STEERING),
+                (*_SUBMIT, "--paper", STEERING),
             )),
             ("names of files", _steering_name, (
                 ("data", "inspect", "-v", "logs"), ("data", "inspect", f"logs/{STEERING}"),
@@ -765,8 +762,8 @@ KILLED = {
               "--cap", "60", "--seed-base", "850", "--env", "cartpole", "--jobs", "1", "--output",
               "out"),
     "fetch": ("data", "fetch", "TINY", "--output", "out"),
-    "submit": (*_SUBMIT, "--id", "other"),
-    "leaderboard build": ("leaderboard", "build", "board/results", "--output", "board"),
+    "submit": (*_SUBMIT, "--name", "other"),
+    "leaderboard build": ("leaderboard", "build", "board"),
     "scan": ("scan", "logs", "--recipe", "logs/recipe.toml", "--json", "scan.json", "--html",
              "scan.html"),
     "export": ("data", "export", "split", "--format", "minari", "--output", "exported"),
@@ -792,7 +789,7 @@ class Full:
         place = ground.copy(home)
         arguments = ["split" if word == "TINY" else word for word in KILLED[self.command]]
         (place / "disk").mkdir()
-        i = arguments.index("--results" if self.command == "submit" else "--output") + 1
+        i = arguments.index("--entries" if self.command == "submit" else "--output") + 1
         arguments[i] = "disk/out"
         mounted = f'mount -t tmpfs -o size={self.room} tmpfs disk && exec "$@"'
         prefix = ("unshare", "--user", "--map-root-user", "--mount", "sh", "-c", mounted, "-")

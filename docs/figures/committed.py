@@ -5,11 +5,12 @@ import functools
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from oodd_leaderboard.reported import SubmittedEntry, read_entries
+from oodd_leaderboard.pages import Leaderboard, read_leaderboard
 
 from oodd_eval.results.board import Board, boards
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.identity import Setting
+from oodd_eval.results.record import Record
 
 ROOT = Path(__file__).parents[2]
 BOARD = ROOT / "leaderboard"
@@ -26,24 +27,30 @@ def lines(path: str) -> list[dict[str, str]]:
 
 
 @functools.cache
-def entries() -> list[SubmittedEntry]:
-    """Return the entries of the leaderboard."""
-    return read_entries(BOARD / "results")
+def leaderboard() -> Leaderboard:
+    """Return the seasons, reported rows and suites of the leaderboard."""
+    return read_leaderboard(BOARD)
+
+
+def reported(split: str) -> list[Record]:
+    """Return the records of the rows reported on a split."""
+    boards_of_rows = (section.ranks.board for section in leaderboard().reported)
+    return [r for board in boards_of_rows for r in board.records if r.split == split]
 
 
 @functools.cache
 def ranking(split: str) -> dict[str, dict[str, str]]:
-    """Return the primary rows of a board by detector."""
-    (file,) = (BOARD / "tables").glob(f"{split}-*-ranking.csv")
+    """Return the rows reported on a split by detector, without variants."""
+    (file,) = (BOARD / "tables").glob(f"{split}-*.csv")
     rows = lines(str(file.relative_to(BOARD)))
-    return {row["detector"]: row for row in rows if row["primary"] == "true"}
+    return {row["detector"]: row for row in rows if row["variant"] == "false"}
 
 
 @functools.cache
 def board(name: str) -> Board:
-    """Return a suite's board, or that of the entries on mini."""
+    """Return a suite's board, or that of the rows reported on mini."""
     if name == "mini":
-        records = [r for e in entries() for r in e.records if r.split == "mini"]
+        records = reported(name)
     else:
         records = ResultsDirectory(BOARD / "suites" / name).records()
     (of_split,) = boards(records)

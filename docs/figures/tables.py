@@ -29,14 +29,14 @@ from committed import (
     board,
     cells,
     claims,
-    entries,
+    leaderboard,
     mean,
     of_reproductions,
     overview,
     ranking,
+    reported,
 )
 from oodd_leaderboard.pages import documents
-from oodd_leaderboard.reported import sections, suite_sections
 
 from oodd_eval.cli.main import main as oodd_eval
 from oodd_eval.data.files import read_text
@@ -281,17 +281,12 @@ def in_output(readme: str) -> Iterator[str]:
     """Yield a line where the README's main command prints something else of committed records."""
     command = readme.partition("<!-- command: main -->")[2]
     detectors = re.search(r"--detector (\S+)", command)[1].split(",")
-    records = [
-        record
-        for entry in entries()
-        for record in entry.records
-        if str(record.setting) in detectors and (record.seed, record.split) == (0, "mini")
-    ]
+    records = [r for r in reported("mini") if str(r.setting) in detectors and r.seed == 0]
     with TemporaryDirectory() as directory:
         in_order = sorted(records, key=lambda record: detectors.index(record.detector))
         ResultsDirectory(Path(directory)).merge_records(in_order)
         text = printed("show", "--stored", directory)
-    if not text.startswith(command.partition("first:\n\n```text\n")[2].partition("```")[0]):
+    if not text.startswith(command.partition("```text\n")[2].partition("```")[0]):
         yield f"README.md: the main command prints\n{text}"
 
 
@@ -309,10 +304,10 @@ def of_leaderboard() -> Iterator[str]:
     Numbers may differ by one in their last printed digit: sums are rounded otherwise on other
     processors. ``leaderboard build --check`` compares bytes.
     """
-    files = documents(sections(entries()), suite_sections(BOARD))
+    files = documents(leaderboard())
     tables = {path.relative_to(BOARD).as_posix() for path in (BOARD / "tables").glob("*.csv")}
     for name in sorted(tables - {*files}):
-        yield f"leaderboard/{name} is of no entry"
+        yield f"leaderboard/{name} is of no record"
     with TemporaryDirectory() as directory:
         for name, content in files.items():
             fresh, committed = Path(directory) / Path(name).name, BOARD / name

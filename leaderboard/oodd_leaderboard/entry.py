@@ -61,7 +61,7 @@ class Entry:
     training
         What it learns from, see `DetectorSpec`. Others than ``nominal`` are not ranked.
     authors, paper, url, year, licence
-        Plain text of one line each, and the year of the paper.
+        Plain text of one line each, and the year of the paper or of the software.
     origin
         Whose row it is; those of strangers are always ``others``.
     """

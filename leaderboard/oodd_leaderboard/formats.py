@@ -141,13 +141,15 @@ def _problems(record: Record) -> Iterator[tuple[str, str]]:
         if not (math.isnan(metric.value) or math.isfinite(metric.value)):
             yield f"metrics.{name}", f"is {metric.value}, expected a finite number"
     trajectories = record.counts.get("test", 0) + record.counts.get("nominal", 0)
-    for name, (top, bottom) in record.per_trajectory.items():
+    for name, terms in record.per_trajectory.items():
         if name not in record.metrics or not metric_info(name).interval:
             yield f"per_trajectory.{short(name)}", "is there without its metric"
-        elif len(top) != trajectories or len(top) > MOST_TEST:
-            yield f"per_trajectory.{name}", f"has {len(top)} terms, expected {trajectories}"
-        elif not np.isfinite([top, bottom]).all() or (bottom < 0).any() or top[bottom == 0].any():
-            yield f"per_trajectory.{name}", "holds what is no ratio, expected finite ones, or 0 / 0"
+        if not len(terms[0]) == trajectories <= MOST_TEST:
+            yield f"per_trajectory.{short(name)}", f"has {len(terms[0])} terms, not {trajectories}"
+    every = np.array([*record.per_trajectory.values()]).reshape(-1, 2, trajectories)
+    top, bottom = every[:, 0], every[:, 1]
+    if not np.isfinite(every).all() or (bottom < 0).any() or top[bottom == 0].any():
+        yield "per_trajectory", "holds what is no ratio, expected finite ones, or 0 / 0"
 
 
 def unsafe(value: Any, path: str = "", levels: int = _DEEPEST) -> Iterator[tuple[str, str]]:

@@ -1,11 +1,9 @@
-"""The files of the leaderboard, rendered from its entries: a page of Markdown, tables, the site."""
+"""The files of the leaderboard, rendered from records: a page of Markdown, tables, the site."""
 
 import contextlib
-import re
 import tomllib
-from collections import Counter
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
@@ -14,27 +12,38 @@ from oodd_eval.data.facts import SPLITS
 from oodd_eval.data.files import PACKED, compress, decompress, write_bytes, write_text
 from oodd_eval.data.split import published_digests
 from oodd_eval.errors import ResultsError
-from oodd_eval.names import counted
+from oodd_eval.metrics.catalogue import UNDEFINED, metric_info
 from oodd_eval.prose import Section, Table
 from oodd_eval.results import tables
 from oodd_eval.results.board import Board
 from oodd_eval.results.record import Record
-from oodd_eval.results.render.tabular import cells_csv, comparisons_csv, ranking_csv
-from oodd_eval.results.render.text import escape, markdown_body, markdown_list, markdown_table
+from oodd_eval.results.render.text import escape, markdown_body, markdown_table
 from oodd_eval.results.report import findings_of
-from oodd_eval.results.standings import RankedBoard, primary_settings, verdict_of
-from oodd_eval.results.tables import Tables
 from oodd_leaderboard import site
-from oodd_leaderboard.published import PUBLISHED, published_bytes
+from oodd_leaderboard.board_csv import cells_csv, standings_csv
+from oodd_leaderboard.entry import Entry
+from oodd_leaderboard.published import (
+    ORIGINS,
+    PUBLISHED,
+    board_table,
+    difference_text,
+    published_bytes,
+)
 from oodd_leaderboard.reported import (
     REPORTED,
     SUITES,
     TABLES,
     LeaderboardSection,
-    SubmittedEntry,
     SuiteSection,
+    by_detector,
+    entries_of,
+    read_reported,
     sections,
+    suite_sections,
 )
+from oodd_leaderboard.season_files import SEASON
+from oodd_leaderboard.seasons import SeasonBoard, read_season_board, read_seasons
+from oodd_leaderboard.standings import OrderedBoard
 
 PAGE: Final = "README.md"
 SITE: Final = "site"
@@ -43,36 +52,49 @@ STALE: Final = "no part of the leaderboard any more"
 
 TEXTS: Final = tomllib.loads(Path(__file__).with_name("page.toml").read_text(encoding="utf-8"))
 
-WIDEST: Final = 12  # rows beyond which the matrix of win rates is left to ``comparisons.csv``
+
+@dataclass(frozen=True, slots=True)
+class Leaderboard:
+    """What a leaderboard's directory holds: seasons, reported rows, further test suites."""
+
+    seasons: Sequence[SeasonBoard] = ()
+    reported: Sequence[LeaderboardSection] = ()
+    suites: Sequence[SuiteSection] = ()
+    entries: Sequence[Entry] = ()
+    alone: bool = False  # a season's directory has no published file
+
+    @property
+    def boards(self) -> list[SeasonBoard | LeaderboardSection]:
+        """All boards in the order of the page."""
+        return [*self.seasons, *self.reported]
 
 
-def _origin(board: str, entry: str, *, primary: bool, trivial: bool) -> dict[str, str]:
-    """Return the columns that stand before a cell's own in the table of all cells."""
-    flags = {"primary": primary, "trivial": trivial}
-    texts = {name: str(flag).lower() for name, flag in flags.items()}
-    return {"board": board, "entry": entry, **texts}
+def read_leaderboard(directory: Path) -> Leaderboard:
+    """Read a leaderboard's directory, or that of a single season.
+
+    `ResultsError`: a season is incomplete, or something cannot be read.
+    """
+    if (directory / SEASON).is_file():
+        return Leaderboard([read_season_board(directory)], alone=True)
+    entries = entries_of(directory)
+    found = sections(read_reported(directory), by_detector(entries))
+    return Leaderboard(read_seasons(directory), found, suite_sections(directory), entries)
 
 
 def build(
-    entries: Sequence[SubmittedEntry],
-    output: Path,
-    suites: Sequence[SuiteSection] = (),
-    *,
-    on_part: Callable[[str], object] = str,
+    leaderboard: Leaderboard, output: Path, *, on_part: Callable[[str], object] = str
 ) -> list[str]:
-    """Write page, tables, site and the published file, the same for the same entries.
+    """Write page, tables, site and the published file, the same for the same records.
 
     Returns their names, the page first. A compressed file with the same content stays as it is,
     whatever has compressed it. `on_part` is called with the name of each part before it is made.
-    ResultsError: the entries contradict one another.
     """
-    on_part("ranking")
-    by_board = sections(entries)
     on_part("page and tables")
-    files = documents(by_board, suites)
-    files[CELLS] = cells(by_board, suites)
+    files = documents(leaderboard)
+    files[CELLS] = cells(leaderboard)
     on_part("site")
-    parts = site.files(by_board, suites, project=repository())
+    boards = leaderboard.reported, leaderboard.suites, leaderboard.seasons
+    parts = site.files(*boards, project=repository())
     files |= {f"{SITE}/{name}": content for name, content in parts.items()}
     for name, content in files.items():
         if isinstance(content, str):
@@ -84,33 +106,43 @@ def build(
     return list(files)
 
 
-def documents(
-    by_board: Sequence[LeaderboardSection], suites: Sequence[SuiteSection] = ()
-) -> dict[str, str | bytes]:
-    """Return what is committed beside the entries by name: page, tables and the published file."""
-    files: dict[str, str | bytes] = {PAGE: page(by_board, suites, site=f"{SITE}/{site.PAGE}")}
-    for section in by_board:
-        files[section.file("ranking")] = ranking_csv(section.ranks)
-        files[section.file("comparisons")] = comparisons_csv(section.ranks)
-    files[PUBLISHED] = published_bytes(by_board, suites)
+def build_season(directory: Path) -> list[str]:
+    """Write page, tables and site of one season into its directory, and return their names."""
+    return build(read_leaderboard(directory), directory)
+
+
+def documents(leaderboard: Leaderboard) -> dict[str, str | bytes]:
+    """Return what is committed beside the records by name: page, tables, the published file."""
+    files: dict[str, str | bytes] = {PAGE: page(leaderboard)}
+    for section in leaderboard.boards:
+        files[_csv(section)] = standings_csv(section.ranks)
+    if not leaderboard.alone:
+        boards = leaderboard.reported, leaderboard.seasons
+        files[PUBLISHED] = published_bytes(*boards, leaderboard.entries)
     return files
 
 
-def cells(sections: Sequence[LeaderboardSection], suites: Sequence[SuiteSection] = ()) -> bytes:
+def _csv(section: SeasonBoard | LeaderboardSection) -> str:
+    return f"{TABLES}/{section.name}.csv"
+
+
+def cells(leaderboard: Leaderboard) -> bytes:
     """Return all cells of boards, and then of suites, as one table (compressed CSV)."""
     lines: list[tuple[dict[str, str], Record]] = []
-    for section in sections:
+    for section in leaderboard.boards:
         for row in section.ranks.standings:
-            entry = section.sources[row.entry]
-            flags = {"primary": row.primary, "trivial": row.trivial}
-            about = _origin("leaderboard", entry.meta.id, **flags)
+            about = _about(section.name, variant=row.variant, trivial=row.trivial)
             lines += [(about, r) for r in row.records]
-    for suite in suites:
-        first = primary_settings(suite.board.records)
+    for suite in leaderboard.suites:
         for r in suite.board.records:
-            flags = {"primary": r.setting in first, "trivial": suite.board.is_trivial(r.setting)}
-            lines.append((_origin(suite.name, "", **flags), r))
+            trivial = suite.board.is_trivial(r.setting)
+            lines.append((_about(suite.name, variant=False, trivial=trivial), r))
     return compress(cells_csv(lines).encode())
+
+
+def _about(board: str, **flags: bool) -> dict[str, str]:
+    """Return the columns that stand before a cell's own in the table of all cells."""
+    return {"board": board} | {name: str(flag).lower() for name, flag in flags.items()}
 
 
 def differences(fresh: Path, existing: Path) -> list[str]:
@@ -148,102 +180,104 @@ def _has_content(path: Path, compressed: bytes) -> bool:
     return False
 
 
-def page(
-    sections: Sequence[LeaderboardSection], suites: Sequence[SuiteSection] = (), *, site: str = ""
-) -> str:
-    """Return the whole page with the sections of suites; it names the `site` if there is one."""
-    entries = {e.meta.id: e for section in sections for e in section.entries}
-    parts = [TEXTS["introduction"], *([TEXTS["site"].format(site=site)] if site else [])]
-    parts += [_contents(sections)] if len(sections) > 1 else []
-    parts += [_section(section) for section in sections]
-    parts += [_suite(suite) for suite in suites]
-    parts += ["## Entries\n", *(_entry(entries[i]) for i in sorted(entries))]
-    return "\n".join(parts)
+def page(leaderboard: Leaderboard) -> str:
+    """Return the whole page: seasons first, then reported rows and further suites."""
+    parts = [TEXTS["introduction"].format(site=f"{SITE}/{site.PAGE}")]
+    if not leaderboard.seasons:
+        parts.append(TEXTS["no-season"])
+    parts += map(_season, leaderboard.seasons)
+    if leaderboard.reported:
+        parts.append(TEXTS["reported"].format(sentence=REPORTED))
+    parts += map(_reported, leaderboard.reported)
+    parts += map(_suite, leaderboard.suites)
+    return "\n".join([*parts, TEXTS["taking-part"]])
 
 
-def _contents(sections: Sequence[LeaderboardSection]) -> str:
-    """Return links to the boards; no two of them are to be compared."""
-    seen: Counter[str] = Counter()
-    lines = ["Boards, which are not to be compared with one another:", ""]
-    for section in sections:
-        title = _title(section.ranks.board)
-        # As GitHub makes addresses of headings, equal ones numbered.
-        slug = re.sub(r"[^a-z0-9 _-]", "", title.lower()).replace(" ", "-")
-        address = f"{slug}-{seen[slug]}" if seen[slug] else slug
-        seen[slug] += 1
-        rows = counted(len(section.ranks.standings), "row(s)")
-        digest = section.ranks.board.digest[:12]
-        lines.append(f"- [{escape(title)}](#{address}), digest {digest}: {rows}")
-    return "\n".join([*lines, ""])
+def _season(board: SeasonBoard) -> str:
+    season, ranks = board.season, board.ranks
+    title = f"Season {season.name}, {season.date}" if season.date else f"Season {season.name}"
+    if season.trial:
+        title += f": a trial and no board, it lacks {' and '.join(board.lacks)}"
+    seeds = ", ".join(map(str, season.seeds))
+    facts = TEXTS["season"].format(
+        bits=season.bits,
+        digest=season.split.digest,
+        protocol=season.protocol,
+        version=season.oodd_eval,
+        seeds=seeds,
+        environments=", ".join(season.environments),
+        table=_csv(board),
+    )
+    return _board(title, facts, ranks, season.entries, [TEXTS["legend"]])
 
 
-def _title(board: Board) -> str:
+def _reported(section: LeaderboardSection) -> str:
+    board = section.ranks.board
     limited = f", first {board.limit} trajectories of each part" if board.limit is not None else ""
-    return f"Split {board.split}, protocol {board.protocol}{limited}"
+    title = f"Reported on {board.split}, protocol {board.protocol}{limited}"
+    size = TEXTS["table"].format(
+        digest=escape(board.digest), date=section.date or UNDEFINED, table=_csv(section)
+    )
+    legend = [] if board.paired else [TEXTS["unpaired-legend"]]
+    facts = f"{about_split(board)}\n\n{size}"
+    return _board(title, facts, section.ranks, section.entries, legend)
 
 
-def _section(section: LeaderboardSection) -> str:
-    ranks, board = section.ranks, section.ranks.board
-    about = [entry.meta for entry in section.entries]
-    ok = sum(r.ok for r in board.records)
-    kinds = ("ranking", "comparisons")
-    files = ", ".join(f"[{kind}]({section.file(kind)})" for kind in kinds)
-    cells = f"{len(board.records)}, of which {ok} ok and {len(board.records) - ok} failed"
-    size = f"Digest {escape(board.digest)}. Rows: {len(ranks.standings)}. Cells: {cells}."
-    plain, placed = Tables(board), Tables(board, intervals=True, standings=ranks.standings)
-    body_tables = [
-        *(() if board.paired else placed.of_logs(whole=True)),
-        *((plain.separability(), placed.guaranteed()) if board.paired else ()),
-        placed.attribution(),
-        tables.cost(ranks),
-        plain.all_metrics(),
-        *plain.all_alarms(),
-        *(_of_paper(ranks) if board.paired else ()),
-        tables.wins(ranks) if len(ranks.ranking.ranks) <= WIDEST else None,
-        tables.failures(board),
-    ]
+def _board(
+    title: str, facts: str, ranks: OrderedBoard, entries: Mapping[str, Entry], legend: Sequence[str]
+) -> str:
+    """Return a board's part of the page: its rows, whose they are, failures, notes."""
+    front = board_table(ranks)
     body = Section(
-        _title(board),
-        verdict=_verdict(ranks),
-        findings=findings_of(board),
-        tables=[table for table in body_tables if table],
-        notes=tables.notes(board),
+        title,
+        findings=findings_of(ranks.board),
+        tables=[t for t in (_authors(ranks, entries), tables.failures(ranks.board)) if t],
+        notes=[*unranked(ranks), *tables.notes(ranks.board)],
     )
     parts = [
-        f"## {escape(body.title)}\n",
-        f"{about_split(board)}\n",
-        f"{size} As CSV: {files}.\n",
-        f"{_who_ran(section.entries)}\n",
-        *(f"> {escape(e.id)}: {escape(e.caption)}\n" for e in about if e.caption),
-        f"**{escape(body.verdict)}**\n",
-        markdown_table(tables.ranking(ranks)),
-        TEXTS["legend" if board.paired else "unpaired-legend"],
-        *markdown_list(tables.ranking_notes(ranks)),
-        "",
+        f"## {escape(title)}\n",
+        f"{facts}\n",
+        *(f"**{escape(sentence)}**\n" for sentence in first_rows(ranks)),
+        *([markdown_table(front)] if front else []),
+        *legend,
         markdown_body(body),
     ]
     return "\n".join(parts)
 
 
-def _verdict(ranks: RankedBoard) -> str:
-    """Return the sentence that comes first, and before it which rows share the first rank."""
-    # A single comparison of two rows is not corrected for all pairs of the board, as ranks are.
-    first = [str(s.entry) for s in ranks.standings if s.rank == 1 and s.primary]
-    if len(first) < 2:
-        return verdict_of(ranks.board)
-    return (
-        f"{', '.join(first)} share the first rank: over all pairs of rows (Holm) no difference is "
-        f"shown. As a single comparison: {verdict_of(ranks.board)}"
-    )
+def unranked(ranks: OrderedBoard) -> list[str]:
+    """Return why rows of a board have no rank; nothing where none has."""
+    rows = [row for row in ranks.standings if row.state and ranks.first]
+    return [f"Not ranked: {row.entry}, {row.state}." for row in rows]
 
 
-def _who_ran(entries: Sequence[SubmittedEntry]) -> str:
-    """Return that rows are reported, and by whom."""
-    ran: dict[str, set[str]] = {}
-    for entry in entries:
-        ran.setdefault(entry.meta.submitter or "nobody named", set()).update(entry.meta.detectors)
-    rows = [f"{who} ({counted(len(names), 'detector(s)')})" for who, names in sorted(ran.items())]
-    return escape(f"{REPORTED} Run by {', '.join(rows)}.")
+def first_rows(ranks: OrderedBoard) -> list[str]:
+    """Return which row is first, and whether it is told from the second; nothing without ranks."""
+    places = [row for row in ranks.standings if row.rank]
+    if len(places) < 2:
+        return []
+    best, second = places[:2]
+    test, phrase = ranks.first[second.entry], metric_info(ranks.board.ranking).phrase
+    band = [str(row.entry) for row in places if row.band]
+    amount = difference_text(test, ranks.board.ranking)
+    if test.told:
+        return [f"{best.entry} is first in {phrase}: it beats {second.entry} by {amount}."]
+    return [f"{', '.join(band)} share the first rank in {phrase}: no difference is shown."]
+
+
+def _authors(ranks: OrderedBoard, entries: Mapping[str, Entry]) -> Table:
+    """Return whose the rows are, what they learn from, and what their seeds gave."""
+    info = metric_info(ranks.board.ranking)
+    lines = []
+    for row in ranks.standings:
+        ends = dict.fromkeys(map(info.text, (row.seed_low, row.seed_high)))
+        url = entries[row.entry.detector].url if row.entry.detector in entries else ""
+        paper = " ".join(filter(None, [row.paper, url]))
+        whose = [ORIGINS[row.origin], row.authors, paper, str(row.year or "")]
+        inputs = row.inputs.replace("observations+actions", "+actions")
+        lines.append([str(row.entry), *whose, inputs, str(row.seeds), " to ".join(ends)])
+    header = ["row", "whose", "authors", "paper", "year", "inputs", "seeds", "mean of a seed"]
+    return Table("Whose the rows are", header, lines, labels=6)
 
 
 def _suite(section: SuiteSection) -> str:
@@ -252,8 +286,9 @@ def _suite(section: SuiteSection) -> str:
     several = len({row.horizon for row in section.board.entries}) > 1
     kind = "graded" if section.graded else "horizons" if several else "nominal"
     texts = TEXTS["suites"][kind if section.board.paired else "logs"]
-    title = f"## {texts['title']}: {escape(_title(section.board))}\n"
-    text = texts["text"].format(split=escape(section.board.split), place=address)
+    board = section.board
+    title = f"## {texts['title']}: split {escape(board.split)}, protocol {board.protocol}\n"
+    text = texts["text"].format(split=escape(board.split), place=address)
     return "\n".join([title, text, *map(markdown_table, section.tables[:1])])
 
 
@@ -270,36 +305,3 @@ def about_split(board: Board) -> str:
     cap = split.episode_cap
     episodes = "whole episodes" if cap is None else f"episodes of at most {cap} steps"
     return str(TEXTS["published"].format(**asdict(split), **tier, episodes=episodes))
-
-
-def _of_paper(ranks: RankedBoard) -> list[Table]:
-    """Return what the paper's alarm does: means, and the layout of the paper's Table 5."""
-    # That has a column per row of the board, so that it is kept to rows with default parameters.
-    records = [r for r in ranks.board.records if not r.overrides]
-    as_in_the_paper = Tables(Board(records)).anomaly_groups() if records else []
-    return [Tables(ranks.board, standings=ranks.standings).papers(), *as_in_the_paper]
-
-
-def _entry(entry: SubmittedEntry) -> str:
-    """Return who submitted an entry, and all that is known of how it was made."""
-    meta = entry.meta
-    text = "{distribution} {version} (plug-in {plugin}, source {source_digest:.12})"
-    plugins = [text.format(**plugin) for plugin in meta.plugins]
-    packages = sorted(meta.environment.get("packages", {}).items())
-    python = f"Python {meta.environment.get('python', '')}"
-    lines = [
-        ("Detectors", ", ".join(sorted(meta.detectors))),
-        ("Split", f"{meta.split}, digest {meta.split_digest[:12]}, protocol {meta.protocol}"),
-        ("Submitted by", f"{meta.submitter or 'nobody named'}, {meta.created}"),
-        ("Citation", meta.citation),
-        ("Plug-ins", "; ".join(plugins)),
-        ("Platform", f"{python}, {meta.environment.get('platform', '')}"),
-        ("Packages", ", ".join(f"{name} {version}" for name, version in packages)),
-        ("Note", meta.caption),
-    ]
-    listed = [f"- {name}: {escape(text)}" for name, text in lines if text]
-    if meta.url:
-        plain = re.fullmatch(r"https?://[^\s<>|\\`]+", meta.url)
-        listed.append(f"- Page: <{meta.url}>" if plain else f"- Page: {escape(meta.url)}")
-    listed += ["", "To run it again:", "", *(f"    {command}" for command in entry.commands)]
-    return "\n".join([f"### {escape(meta.id)}: {escape(meta.title)}", "", *listed, ""])

@@ -71,7 +71,7 @@ class Command(click.Command):
         self.handler, self.examples, self._repeated = handler, examples, repeated
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Read the arguments, with ``--primary a b`` as ``--primary=a --primary=b``."""
+        """Read the arguments, with ``--records a b`` as ``--records=a --records=b``."""
         words, option = [], ""
         for word, following in zip(args, [*args, "-"][1:], strict=True):
             if word in self._repeated and not following.startswith("-"):

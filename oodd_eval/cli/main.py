@@ -23,7 +23,7 @@ FIRST_STEPS: Final = (
     "run --detector mewma --env hopper  evaluate a detector, in seconds",
     "show oodd-results                  print tables of that run again",
     "list detectors                     list what else can be run",
-    "leaderboard show                   print the published board",
+    "leaderboard show                   print the board",
     "data inspect LOGS                  look at logs of your own system",
 )
 
@@ -52,21 +52,17 @@ DATA: Final[Commands] = {
 }
 
 LEADERBOARD: Final[Commands] = {
-    "show": ("print the published board", "oodd_leaderboard.commands.published_board:show"),
+    "show": ("print the last season's board", "oodd_leaderboard.commands.published_board:show"),
     "place": (
         "show where a run would stand on it",
         "oodd_leaderboard.commands.published_board:place_run",
     ),
-    "submit": (
-        "write an entry from a results directory",
-        "oodd_leaderboard.commands.entries:submit",
-    ),
-    "verify": ("check entries as data", "oodd_leaderboard.commands.entries:verify"),
+    "submit": ("write an entry from a run", "oodd_leaderboard.commands.entries:submit"),
     "season": (
         "run every entry on a fresh split (extra sim)",
         "oodd_leaderboard.commands.season:season",
     ),
-    "build": ("render tables and site from the entries", "oodd_leaderboard.commands.entries:build"),
+    "build": ("render page, tables and site", "oodd_leaderboard.commands.entries:build"),
 }
 
 POLICIES: Final[Commands] = {

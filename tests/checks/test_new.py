@@ -85,8 +85,7 @@ def test_commands_in_the_projects_readme_exist():
     commands = re.findall(r"(?:^|`)oodd-eval ([^\n`]+)", text, re.MULTILINE)
     assert len(commands) >= 4
     for line in commands:
-        # The README speaks of verifying what submitting has written.
-        parse(f"oodd-eval {line}{' entry' * line.endswith('verify')}")
+        parse(f"oodd-eval {line}")
 
 
 def workflow():
@@ -130,5 +129,7 @@ def test_next_commands_are_printed(tmp_path, capsys, monkeypatch):
     assert "  src/oodd_slow/detector.py\n" in printed
     install, *commands = printed.partition("next:\n")[2].splitlines()
     assert install == '  pip install -e "./oodd-slow[test]"'
-    assert all(parse(command.strip()) for command in commands)
+    wheel, submit = map(str.strip, commands[-2:])
+    assert wheel == 'pip wheel --no-deps --wheel-dir dist "./oodd-slow"'
+    assert all(parse(command.strip()) for command in (*commands[:-2], submit))
     assert (tmp_path / "oodd-slow" / "pyproject.toml").is_file()

@@ -25,7 +25,7 @@ WRITTEN = {
 }  # fmt: skip
 """Parameters at whose paths commands write, of all but those of the leaderboard."""
 
-TEXTS = {("data import", "name"), ("leaderboard submit", "hub")}
+TEXTS = {("data import", "name")}
 """Parameters that may stand for a path, and are compared with outputs by the command itself."""
 
 

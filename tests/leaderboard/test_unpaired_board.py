@@ -1,20 +1,15 @@
-"""A board of logs from end to end: results, plots, curves, entries, pages and the site."""
+"""Reported rows of logs from end to end: results, plots, curves, pages."""
 
 import json
-import time
+import shutil
 
 import helpers_logs
-import helpers_site
 import numpy as np
 import pytest
-from helpers_records import make_record
-from helpers_submission import Draft
-from oodd_leaderboard import published, site
-from oodd_leaderboard.curve_file import check_curves, read_curves
+from oodd_leaderboard import published
+from oodd_leaderboard.curve_file import check_curves, make_curves, read_curves, write_curves
 from oodd_leaderboard.curves import pooled_roc
-from oodd_leaderboard.pages import build, differences
-from oodd_leaderboard.reported import read_entries, sections
-from oodd_leaderboard.submit import Statement, submit
+from oodd_leaderboard.pages import build, differences, read_leaderboard
 
 from oodd_eval import evaluate
 from oodd_eval.cli.main import main
@@ -24,6 +19,7 @@ from oodd_eval.data.split import Split
 from oodd_eval.errors import ResultsError, UsageError
 from oodd_eval.metrics.alarms import GuaranteedAlarm
 from oodd_eval.metrics.unpaired import UnpairedScores, separability
+from oodd_eval.results.directory import ResultsDirectory
 
 ROWS = ("clock", "mahalanobis", "persistence", "random", "range")
 """The rows of the board: they need no library and take no time."""
@@ -82,24 +78,15 @@ def results(split, directory):
 
 
 @pytest.fixture(scope="module")
-def entries(split, directory, tmp_path_factory):
-    """A directory of entries with one, of all rows with curves."""
-    root = tmp_path_factory.mktemp("board") / "results"
-    statement = Statement(id="logs", submitter="A. Tester")
-    submission = submit(directory, root, statement, split=split.path)
-    assert submission.verdict.ok, submission.verdict.findings.problems
-    return root
-
-
-@pytest.fixture(scope="module")
-def small(split, tmp_path_factory):
-    """An entry of two rows, to tamper with."""
-    home = tmp_path_factory.mktemp("small")
-    evaluate(("clock", "range"), split, output=home / "results")
-    statement = Statement(id="small", submitter="A. Tester")
-    written = submit(home / "results", home / "entries", statement, split=split.path, curves="none")
-    assert written.verdict.ok
-    return written.path
+def leaderboard(split, directory, tmp_path_factory):
+    """A leaderboard's directory with the rows as reported ones, and their curves."""
+    home = tmp_path_factory.mktemp("leaderboard")
+    target = home / "results" / "logs"
+    target.mkdir(parents=True)
+    shutil.copy(directory / "records.jsonl", target)
+    source = ResultsDirectory(directory)
+    write_curves(make_curves(source.records(), source, split), target / "curves.json")
+    return home
 
 
 # Results and plots
@@ -210,8 +197,8 @@ def test_the_area_below_a_pooled_curve_is_the_pooled_auc():
         assert (np.diff(curve) >= 0).all()
 
 
-def test_curves_are_read_back_and_have_no_twin(entries, split):
-    units = read_curves(entries / "logs" / "curves.json")["units"]
+def test_curves_are_read_back_and_have_no_twin(leaderboard):
+    units = read_curves(leaderboard / "results" / "logs" / "curves.json")["units"]
     assert len(units) == 4 * len(ROWS)
     assert not [
         key
@@ -248,183 +235,40 @@ def changed(record, path, value):
         ("paired", True, "units[0]"),
     ],
 )
-def test_a_wrong_field_of_curves_is_named(entries, field, value, problem):
-    plain = json.loads((entries / "logs" / "curves.json").read_text())
+def test_a_wrong_field_of_curves_is_named(leaderboard, field, value, problem):
+    plain = json.loads((leaderboard / "results" / "logs" / "curves.json").read_text())
     changed(plain["units"][0], field, value)
     with pytest.raises(ResultsError) as error:
         check_curves(plain, "curves.json")
     assert problem in str(error.value)
 
 
-# Entries
-
-
-def test_an_entry_is_verified(entries, split, capsys):
-    assert main(["leaderboard", "verify", str(entries), "--split", str(split.path)]) == 0
-    assert "valid, 20 cells" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("path", "value", "problem"),
-    [
-        ("environment", "Arm", "environment"),
-        ("anomaly", "a b", "anomaly"),
-        ("anomaly", "other", "anomaly"),
-        ("group", "other", "group"),
-        ("paired", True, "environment"),
-        ("counts.nominal", 7, "per_trajectory"),
-        ("metrics.auc_pool.value", 1.5, "metrics.auc_pool.value"),
-        ("metrics.auc_pool.value", 0.123, "metrics.auc_pool.value"),
-        ("metrics.auc_matched", {"value": 1.0, "low": 1.0, "high": 1.0, "n": 2}, "auc_matched"),
-        ("note", "<b>", "note"),
-    ],
-)
-def test_a_tampered_record_is_refused(small, split, tmp_path, path, value, problem):
-    draft = Draft(small, tmp_path)
-    changed(draft.records[0], path, value)
-    verdict = draft.verdict(split.path)
-    assert not verdict.ok
-    assert any(problem in text.text for text in verdict.findings.problems)
-
-
-def test_an_environment_counts_with_all_its_anomalies(small, split, tmp_path):
-    draft = Draft(small, tmp_path)
-    left_out = next(r for r in draft.records if r["anomaly"] == "leak")
-    draft.records.remove(left_out)
-    verdict = draft.verdict(split.path)
-    assert any("press lacks leak" in p.text for p in verdict.findings.problems)
-
-
 # Pages
 
 
-def test_a_board_is_built_the_same_twice_and_beside_others(entries, tmp_path):
-    read = read_entries(entries)
+def test_a_board_is_built_the_same_twice(leaderboard, tmp_path):
+    read = read_leaderboard(leaderboard)
     files = build(read, tmp_path / "one")
     build(read, tmp_path / "two")
     assert not differences(tmp_path / "one", tmp_path / "two")
-    (ranking,) = [name for name in files if name.endswith("-ranking.csv")]
-    assert "-unpaired-" in ranking
+    (table,) = [name for name in files if name.startswith("tables/")]
+    assert "-unpaired" in table
     page = (tmp_path / "one" / "README.md").read_text()
-    assert "### Ranking by pooled AUC (%)" in page
+    assert "### Pooled AUC and guaranteed alarms at 5 % (%)" in page
     assert "Episodes of press: 6 training, 40 calibration, 9 nominal test" in page
-    assert "guaranteed alarms at 5 %: press" in page
-    assert "The row *clock*" not in page
-    words = page.partition("## Entries")[0].partition("## Split logs")[2].lower()
-    for word in ("placebo", "matched auc", "environment | result", "false-alarm rate, sensor"):
+    words = page.partition("## Reported on logs")[2].partition("## How to take part")[0].lower()
+    for word in ("placebo", "matched auc", "false-alarm rate, sensor"):
         assert word not in words
-    both = [*read, *helpers_site.example(tmp_path / "benchmark")]
-    build(both, tmp_path / "both")
-    assert "Ranking by matched AUC (%)" in (tmp_path / "both" / "README.md").read_text()
 
 
-def test_a_run_is_placed_on_the_board_of_its_split(
-    entries, directory, tmp_path, monkeypatch, capsys
+def test_a_run_is_placed_beside_the_rows_of_its_split(
+    leaderboard, directory, tmp_path, monkeypatch, capsys
 ):
-    build(read_entries(entries), tmp_path)
+    build(read_leaderboard(leaderboard), tmp_path)
     monkeypatch.setattr(published, "published_file", lambda: tmp_path / published.PUBLISHED)
     assert main(["leaderboard", "show", "--split", "logs"]) == 0
-    text = capsys.readouterr().out
-    assert "Ranking by separability: pooled AUC (%), higher is better" in text
-    assert "Ranking by guaranteed alarms at 5 %" in text
+    assert "Pooled AUC" in capsys.readouterr().out
     assert main(["leaderboard", "place", str(directory), "--detector", "range"]) == 0
-    text = capsys.readouterr().out
+    text = " ".join(capsys.readouterr().out.split())
     assert "> range" in text
-    assert "It has the numbers of that row of entry logs" in " ".join(text.split())
-    board = published.read_published(tmp_path / published.PUBLISHED).boards[0]
-    whole = sections(read_entries(entries))[0].ranks
-    assert board.ranks().ranking.ranks == whole.ranking.ranks
-    assert board.ranks().alarms.ranks == whole.alarms.ranks
-    other = [make_record(digest=board.conditions.split_digest)]
-    with pytest.raises(UsageError, match="cannot be compared"):
-        published.board_of(other, [board])
-    with pytest.raises(UsageError, match="oodd-eval compare"):
-        published.board_of(board.records, [])
-
-
-# The site
-
-
-@pytest.fixture(scope="module")
-def address(entries, tmp_path_factory):
-    directory = tmp_path_factory.mktemp("site")
-    others = helpers_site.example(tmp_path_factory.mktemp("benchmark"))
-    everything = sections([*read_entries(entries), *others])
-    return helpers_site.write_site(directory, site.files(everything))
-
-
-VIEWS = ("ranking", "guaranteed", "environments", "anomalies", "rows", "cost")
-
-
-def go(window, place):
-    window.run("location.hash = arguments[0]", place)
-    time.sleep(0.2)
-    window.wait_for("!document.querySelector('[aria-busy]') && !document.querySelector('.failure')")
-
-
-@pytest.fixture
-def board(window, address):
-    """The site at the board of logs; its id, and the ids of its rows."""
-    window.open("about:blank")
-    window.console()
-    window.open(address)
-    script = """
-        const boards = JSON.parse(document.getElementById("data").textContent).boards;
-        const board = boards.find((b) => !b.paired);
-        return [board.id, board.rows.map((row) => row.id)];
-    """
-    identity, rows = window.run(script)
-    yield identity, rows
-    assert window.console() == []
-
-
-@pytest.mark.browser
-@pytest.mark.parametrize("width", [1280, 390])
-def test_no_view_speaks_of_twins_or_scrolls_sideways(window, board, width):
-    identity, rows = board
-    first, second = (window.run("return encodeURIComponent(arguments[0])", row) for row in rows[:2])
-    places = [f"#/?board={identity}&view={view}" for view in VIEWS]
-    places += ["#/heat", "#/cost", f"#/detector/{first}/arm/wear", f"#/detector/{first}/press/jam"]
-    places += [f"#/compare/{first}/{second}"]
-    with window.narrow(width):
-        for place in places:
-            go(window, place)
-            wide, inner = window.run("return [document.documentElement.scrollWidth, innerWidth]")
-            assert wide <= inner, place
-            text = window.run("return document.querySelector('main').innerText").lower()
-            text = text.replace("without twins", "")
-            assert "undefined" not in text.replace("undefined.", ""), place
-            of_metrics = text.partition("all metrics\n")[0]
-            assert "twin" not in of_metrics, place
-            assert "matched" not in of_metrics, place
-
-
-@pytest.mark.browser
-def test_the_board_of_logs_has_its_columns_filters_and_figures(window, board):
-    identity, rows = board
-    go(window, f"#/?board={identity}")
-    titles = [text.splitlines()[0].strip("↕▼▲ ") for text in window.texts("#ranking thead th")]
-    assert titles[2:] == ["Pooled AUC", "Pooled AUC null", "AUC of rows", "Wins", "Lead"]
-    assert window.text("#ranking thead [aria-sort='descending'] button").startswith("Pooled AUC")
-    window.choose("environment", "press")
-    assert window.text("#ranking caption").startswith("Separability: press")
-    window.choose("anomaly", "jam")
-    assert "1 cell" in window.text("#ranking caption")
-    window.choose("anomaly", "slip")  # which the press has not
-    assert "0 cells" in window.text("#ranking caption")
-    first = window.run("return encodeURIComponent(arguments[0])", rows[0])
-    go(window, f"#/detector/{first}/arm/wear")
-    window.wait_for("document.querySelectorAll('#cell svg').length >= 4")
-    shaded = window.run("return document.querySelectorAll('#cell .anomalous-rows rect').length")
-    assert shaded in (2, 4)  # one or two intervals, in both drawings
-    assert window.run("return document.querySelectorAll('#cell .line.twin').length") == 0
-
-
-@pytest.mark.browser
-@pytest.mark.usefixtures("board")
-def test_a_view_that_a_board_lacks_becomes_its_first(window):
-    go(window, "#/?view=aucs")
-    titles = window.texts("select[name=board] option")
-    window.choose("board", next(title for title in titles if title.startswith("logs")))
-    assert window.run("return document.querySelector('[name=view]:checked').value") == "ranking"
-    assert "Split logs" in window.texts("#notes li")[0]
+    assert "The board has that row with the same numbers" in text

@@ -52,7 +52,7 @@ def test_help_of_a_group_needs_no_extra_of_its_commands(capsys, monkeypatch):
     assert cli.main(["leaderboard", "--help"]) == 0
     text = capsys.readouterr().out
     assert "  submit " in text
-    assert "oodd-eval leaderboard verify" in text.partition("\nExamples:\n")[2]
+    assert "oodd-eval leaderboard build" in text.partition("\nExamples:\n")[2]
 
 
 @pytest.mark.parametrize(
@@ -72,7 +72,7 @@ def test_every_command_has_help_with_examples_that_can_be_parsed(capsys, words):
     ("arguments", "message"),
     [
         ("data bild", "unknown command of data 'bild': did you mean 'build'?"),
-        ("leaderboard submit x --primary", "--primary"),
+        ("leaderboard submit x --detector", "--detector"),
         ("data build mini --train 3", "is published: --train would make another"),
         ("data build dev", "--train, --calibration, --test, --seed-base must be given"),
         ("policies train antt", "unknown environment 'antt': did you mean 'ant'?"),

@@ -3,7 +3,6 @@
 pip needs an index here, as it does for whoever follows the page.
 """
 
-import json
 import os
 import re
 import shutil
@@ -14,6 +13,7 @@ import time
 import pytest
 import yaml
 from helpers_docs import ROOT, commands
+from oodd_leaderboard.entry import read_entries
 
 pytestmark = pytest.mark.packaging
 
@@ -56,18 +56,19 @@ def test_the_tutorial_leads_from_nothing_to_a_place_on_the_board(tmp_path, wheel
 
     # What `new` prints as the next commands is what the page goes through.
     printed = told[f"oodd-eval new {NAME}"].partition("next:\n")[2].splitlines()
-    assert len(printed) == 5
+    assert len(printed) == 6
     for line in map(str.strip, printed):
         assert any(shown.startswith(line) for shown in page), line
     listed = told["oodd-eval list detectors"]
     assert re.search(rf"^{NAME} +oodd-{NAME} 0\.1\.0", listed, re.MULTILINE)
     assert "editable" not in walker.run("pip list").lower().partition("oodd-eval")[2].split()[0]
-    (entry,) = (tmp_path / "leaderboard" / "results").iterdir()
-    assert json.loads((entry / "entry.json").read_text())["detectors"] == [NAME]
-    for directory in ("oodd-results --detector slow-drift", f"leaderboard/results/{entry.name}"):
-        said = told[f"oodd-eval leaderboard place {directory}"]
-        assert re.search(rf"^{NAME}: rank \d+ by separability, rank \d+ by", said, re.MULTILINE)
-        assert "lacks" not in said
+    (entry,) = read_entries(tmp_path / "leaderboard" / "entries")
+    assert (entry.detector, entry.wheel) == (
+        NAME,
+        f"oodd_{NAME.replace('-', '_')}-0.1.0-py3-none-any.whl",
+    )
+    said = told["oodd-eval leaderboard place oodd-results --detector slow-drift"]
+    assert re.search(rf"^{NAME} stands at place \d+ of \d+ by mean", said, re.MULTILINE)
 
     # The project's CI: first as it is, and then with the wheel that it waits for.
     project = f"oodd-{NAME}"

@@ -42,6 +42,8 @@ def new(options: Options) -> int:
             f'\nnext:\n  pip install -e "{path}[test]"\n  oodd-eval check {project.name}\n'
             f"  oodd-eval run --detector {project.name} --env all\n"
             "  oodd-eval leaderboard place oodd-results\n"
-            f"  oodd-eval leaderboard submit oodd-results --detector {project.name}"
+            f'  pip wheel --no-deps --wheel-dir dist "{path}"\n'
+            f"  oodd-eval leaderboard submit oodd-results --detector {project.name} "
+            f"--wheel dist/{project.wheel}"
         )
     return 0

@@ -71,6 +71,11 @@ class Project:
         return self.distribution.replace("-", "_")
 
     @property
+    def wheel(self) -> str:
+        """Name of the file that pip makes of its first version."""
+        return f"{self.module}-0.1.0-py3-none-any.whl"
+
+    @property
     def class_name(self) -> str:
         """Name of the detector's class, without "Detector"."""
         return "".join(part.capitalize() for part in self.name.split("-"))
@@ -82,6 +87,7 @@ class Project:
             "@NAME@": self.name,
             "@DISTRIBUTION@": self.distribution,
             "@MODULE@": self.module,
+            "@WHEEL@": self.wheel,
             "@CLASS@": self.class_name,
             "@PROJECT@": "oodd-eval",
             "@SOURCE@": _WHEEL,
