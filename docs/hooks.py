@@ -169,9 +169,10 @@ def board() -> dict[str, str | bytes]:
     if not (ROOT / RESULTS[0]).exists():
         return {}
     board = read_leaderboard(ROOT / "leaderboard")
-    links = site.links(ROOT / "leaderboard")
+    # Pages of Markdown that it links to are pages of this site.
+    pages = {"home": "../../index.html", "submit": "../../submitting.html"}
+    links = {**pages, "source": repository()}
     shown = site.files(board.reported, board.suites, board.seasons, links=links)
-    # The page of Markdown that it links to is a page of this site.
     page = shown[site.PAGE].replace('href="../README.md"', 'href="../index.html"')
     files = {**shown, site.PAGE: page, Path(CELLS).name: cells(board)}
     return {f"{BOARD}/{name}": content for name, content in files.items()}

@@ -1,4 +1,4 @@
-"""Entries of a leaderboard made by hand, and the data of a site as large as it gets."""
+"""Seasons and reported rows made by hand, and the data of a site as large as it gets."""
 
 import json
 import re
@@ -10,14 +10,12 @@ from helpers_records import PAIRED, make_record
 from oodd_leaderboard import site
 from oodd_leaderboard.curve_file import write_curves
 from oodd_leaderboard.curves import Sweep, cell_curves, thresholds
-from oodd_leaderboard.reported import (
-    EntryInfo,
-    SubmittedEntry,
-    read_entries,
-    sections,
-    suite_sections,
-)
+from oodd_leaderboard.entry import Entry
+from oodd_leaderboard.reported import Reported, sections, suite_sections
+from oodd_leaderboard.season_files import Installed, Season, SeasonSplit
+from oodd_leaderboard.seasons import SeasonBoard
 from oodd_leaderboard.site.content import site_data
+from oodd_leaderboard.standings import ordered
 
 from oodd_eval.data.condition import rungs_of
 from oodd_eval.metrics.auc import AlarmRule, Contribution
@@ -34,35 +32,14 @@ SIMILAR = {"delay_censored_null": "delay_null", "missed_null": "missed"}
 """Metrics without a level whose numbers stand in for guaranteed alarms; otherwise ``far_twin``."""
 
 
-def submitted(name, records, **meta):
-    """An entry in memory."""
-    first = records[0]
-    texts = {"title": "An entry", "citation": "", "url": "", "caption": "",
-             "submitter": "Somebody", "created": "2026-11-21"}  # fmt: skip
-    plugin = {"distribution": "oodd-eval", "plugin": "riqn", "version": "0.1.0",
-              "source_digest": "0" * 64}  # fmt: skip
-    made_with = {"python": "3.11.7", "platform": "Linux", "packages": {"numpy": "2.4.6"}}
-    info = EntryInfo(
-        id=name, detectors=sorted({r.detector for r in records}), split=first.split,
-        split_digest=first.split_digest, protocol=first.protocol,
-        **texts | {"plugins": [plugin], "environment": made_with} | meta,
-    )  # fmt: skip
-    return SubmittedEntry(Path(name), info, records)
-
-
-def write_entry(root, identity, records, *, curves=(), **fields):
-    """Write one entry; `curves` names detectors whose cells get some."""
-    directory = root / identity
-    directory.mkdir(parents=True)
-    lines = [record.to_json() + "\n" for record in records]
-    (directory / "records.jsonl").write_text("".join(lines), encoding="utf-8")
+def report(root, name, records, *, curves=()):
+    """Reported records in a directory; `curves` names detectors whose cells get some."""
+    directory = Path(root) / name
     units = [make_curves(r, i) for i, r in enumerate(records) if r.ok and r.detector in curves]
     if units:
+        directory.mkdir(parents=True)
         write_curves({"units": units}, directory / "curves.json")
-    texts = {"title": f"Entry {identity}", "submitter": "A. Nonymous", "citation": "Page 1954",
-             "url": "https://example.org/page", "plugins": [], "environment": {}}  # fmt: skip
-    text = submitted(identity, records, **texts | fields).meta.to_json()
-    (directory / "entry.json").write_text(text, encoding="utf-8")
+    return Reported(directory, list(records))
 
 
 GRADED_ROWS = {"riqn": (0, 0.5), "rf": (0.5, 1), "clock": (0, 0)}
@@ -127,57 +104,96 @@ def values(rng, level, n=4):
     return found
 
 
-SKILLS = {"riqn": 0.9, "rf": 0.7, "persistence": 0.55, "clock": 0.5}
+ROWS = {"riqn": 0.9, "rf": 0.7, "mine": 0.69, "clock": 0.5, "oracle": 0.95, "broken": 0.8}
+"""Rows of the example and about what matched AUC they have."""
+
+ENTRIES = {
+    "riqn": Entry("riqn", authors="Danesh, Fern", paper="Benchmarks <b>", year=2021,
+                  url="https://example.org/page", origin="paper"),
+    "rf": Entry("rf", authors="The developers", origin="project"),
+    "mine": Entry("mine", wheel="mine-1.2-py3-none-any.whl", sha256="12" * 32, licence="MIT",
+                  authors="<b>Eve</b>", url="javascript:alert(1)", year=2026),
+    "clock": Entry("clock", origin="trivial"),
+    "oracle": Entry("oracle", origin="oracle", training="oracle"),
+    "broken": Entry("broken"),
+}  # fmt: skip
+
+CELLS = [(e, a) for e in ("cartpole", "hopper") for a in ("iid", "drift", "gravity", "components")]
+
+
+def row_records(detector, *, rng, level=None, cells=CELLS, failed=(), seeds=(0,), n=8, **fields):
+    """A row's records in some cells, of which some have failed."""
+    records = []
+    for (environment, anomaly), seed in ((cell, seed) for cell in cells for seed in seeds):
+        broken = (environment, anomaly) in failed
+        record = make_record(
+            detector, environment, anomaly, seed=seed, deterministic=len(seeds) == 1,
+            values=values(rng, level or ROWS[detector], n),
+            status="timeout" if broken else "ok", reason="not done after 5 s" if broken else "",
+            **fields,
+        )  # fmt: skip
+        records.append(describe(record, inputs="observations"))
+    return records
+
+
+def season(*, name="2026-11", date="2026-11-27", trial=False, cells=CELLS, rows=tuple(ROWS)):
+    """A season of made-up rows: one fails in two cells, one is an oracle, one a stranger's."""
+    rng = np.random.default_rng(0)
+    failed = {"broken": cells[:2]}
+    settings = {"digest": "5e" * 32}
+    records = [
+        replace(record, split=f"season-{name}")
+        for row in rows
+        for record in row_records(row, rng=rng, cells=cells, failed=failed.get(row, ()),
+                                  seeds=(0, 1, 2) if row == "riqn" else (0,), **settings)
+    ]  # fmt: skip
+    conditions: dict[str, list[str]] = {}
+    for environment, anomaly in cells:
+        conditions.setdefault(environment, []).append(anomaly)
+    about = Season(
+        name=name, bits="0123456789abcdef" * 2, protocol=1, oodd_eval="0.3.0",
+        split=SeasonSplit(f"season-{name}", "5e" * 32, {}), seeds=[0, 1, 2],
+        environments=list(conditions), conditions=conditions, trial=trial, date=date,
+        entries={row: ENTRIES[row] for row in rows},
+        installed={"mine": [Installed("mine", "1.2", "12" * 32)]},
+    )  # fmt: skip
+    lacks = ["environments ant, arm"] if trial else []
+    return SeasonBoard(about, ordered(records, ENTRIES, expected=about.expected), lacks)
 
 
 def example(root):
-    """Three entries on two boards: two environments, four anomalies, horizons, a failure, seeds."""
-    root = root / "results"
-    rng = np.random.default_rng(0)
-    cells = [(e, a) for e in ("cartpole", "hopper") for a in ("iid", "drift", "gravity",
-                                                              "components")]  # fmt: skip
-
-    def records(detector, *, level=None, inputs="observations", broken=(), **settings):
-        found = []
-        for environment, anomaly in cells:
-            failed = (environment, anomaly) in broken
-            record = make_record(
-                detector, environment, anomaly, digest=settings.get("digest", DIGEST),
-                values=values(rng, level or SKILLS[detector]),
-                status="timeout" if failed else "ok", reason="not done after 5 s" if failed else "",
-                **{k: v for k, v in settings.items() if k != "digest"},
-            )  # fmt: skip
-            found.append(describe(record, inputs=inputs))
-        return found
-
-    write_entry(
-        root, "forecasters",
-        [
-            *records("riqn", inputs="observations+actions"),
-            *records("riqn", level=0.8, horizon=10, inputs="observations+actions"),
-            *records("rf", seed=0), *records("rf", seed=1),
-        ],
-        curves=("riqn",), caption="Three members instead of five.",
-    )  # fmt: skip
-    write_entry(root, "trivial", [*records("persistence"), *records("clock")])
-    broken = {("hopper", "iid"), ("hopper", "drift")}
-    write_entry(
-        root, "third-party",
-        records("mine", level=0.6, broken=broken, overrides={"window": 3}),
-        title="<b>bold</b>", url="javascript:alert(1)",
-    )  # fmt: skip
-    write_entry(root, "other-digest", records("rf", digest="cd" * 32))
-    return read_entries(root)
+    """Reported rows of two digests, of which one has curves, and a variant."""
+    rng = np.random.default_rng(1)
+    rows = [
+        *row_records("riqn", rng=rng), *row_records("riqn", rng=rng, level=0.8, horizon=10),
+        *row_records("rf", rng=rng), *row_records("clock", rng=rng),
+    ]  # fmt: skip
+    reported = [
+        report(root, "forecasters", rows, curves=("riqn",)),
+        report(root, "third-party", row_records("mine", rng=rng, overrides={"window": 3})),
+        report(root, "other-digest", row_records("rf", rng=rng, digest="cd" * 32)),
+    ]
+    return sections(reported, ENTRIES)
 
 
-def full(root, rows):
-    """Files of a site with so many detectors: the first row of the example, under other names."""
-    data, _ = site_data(sections(example(root)))
+def full(rows):
+    """Files of a site with so many rows: the first one of a season, under other names."""
+    data, _ = site_data((), (), [season()])
     board = data["boards"][0]
     names = [f"detector-{i}" for i in range(rows)]
     board["rows"] = [
         board["rows"][0]
-        | {"id": f"board/{name}", "part": name, "label": name, "detector": name, "rank": i + 1}
+        | {
+            "id": f"board/{name}",
+            "part": name,
+            "label": name,
+            "detector": name,
+            "rank": i + 1,
+            "place": i,
+            "first": None,
+            "above": None,
+            "equal": False,
+        }
         for i, name in enumerate(names)
     ]
     return {site.PAGE: site.index(data)}

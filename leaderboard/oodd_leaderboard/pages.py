@@ -7,7 +7,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
-from oodd_eval._version import repository
 from oodd_eval.data.facts import SPLITS
 from oodd_eval.data.files import PACKED, compress, decompress, write_bytes, write_text
 from oodd_eval.data.split import published_digests
@@ -94,7 +93,7 @@ def build(
     files[CELLS] = cells(leaderboard)
     on_part("site")
     boards = leaderboard.reported, leaderboard.suites, leaderboard.seasons
-    parts = site.files(*boards, project=repository())
+    parts = site.files(*boards, links=site.links(output))
     files |= {f"{SITE}/{name}": content for name, content in parts.items()}
     for name, content in files.items():
         if isinstance(content, str):

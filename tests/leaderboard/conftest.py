@@ -6,9 +6,15 @@ import pytest
 
 
 @pytest.fixture(scope="session")
-def entries(tmp_path_factory):
-    """Three entries of the example; see `helpers_site.example`."""
+def reported(tmp_path_factory):
+    """Tables of reported rows; see `helpers_site.example`."""
     return helpers_site.example(tmp_path_factory.mktemp("results"))
+
+
+@pytest.fixture(scope="session")
+def season():
+    """A season; see `helpers_site.season`."""
+    return helpers_site.season()
 
 
 @pytest.fixture(scope="session")

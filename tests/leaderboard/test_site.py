@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from oodd_leaderboard import site
 from oodd_leaderboard.curve_file import read_curves
-from oodd_leaderboard.reported import REPORTED, read_entries, sections
+from oodd_leaderboard.reported import REPORTED, sections
 from oodd_leaderboard.site.content import (
-    WITH_INTERVALS,
     gridded,
     part_name,
     selections,
@@ -22,25 +21,24 @@ from oodd_leaderboard.site.content import (
 
 from oodd_eval import __version__
 from oodd_eval.data.condition import rungs_of
-from oodd_eval.data.facts import ENVIRONMENTS, TABLE1
 from oodd_eval.data.split import load_split
 from oodd_eval.errors import ResultsError
-from oodd_eval.metrics.catalogue import METRICS, NAMES, metric_info
+from oodd_eval.metrics.catalogue import METRICS, metric_info
 
 STATIC = Path(site.__file__).parent / "static"
+
+LINKS = {"home": "../../README.md", "submit": "../../docs/submitting.md", "source": "../../."}
+
+EVIL = "</script><script>alert(1)</script><!-- <b> & \u2028 @style@"
 
 
 def printed(value, metric):
     return metric_info(metric).text(float("nan") if value is None else value)
 
 
-def page_of(entries):
-    return site.files(sections(entries))[site.PAGE]
-
-
 @pytest.fixture(scope="module")
-def files(entries):
-    return site.files(sections(entries))
+def files(reported, season):
+    return site.files(reported, (), [season], links=LINKS)
 
 
 @pytest.fixture(scope="module")
@@ -53,19 +51,14 @@ def embedded(page):
     return json.loads(found[1])
 
 
-def row(data, label, board=0):
-    (found,) = [r for r in data["boards"][board]["rows"] if r["label"] == label]
+def row(page, label, board=0):
+    (found,) = [r for r in embedded(page)["boards"][board]["rows"] if r["label"] == label]
     return found
 
 
 def part(files, label, board=0):
     """The part of a row."""
-    return helpers_site.read_part(files, row(embedded(files[site.PAGE]), label, board)["part"])
-
-
-@pytest.fixture(scope="module")
-def graded(tmp_path_factory):
-    return helpers_site.graded(tmp_path_factory.mktemp("board"))
+    return helpers_site.read_part(files, row(files[site.PAGE], label, board)["part"])
 
 
 # -- the page -------------------------------------------------------------------------------------
@@ -77,28 +70,58 @@ def test_every_part_of_the_page_is_filled_in(page):
     assert page.count("'sha256-") == 2
 
 
-def test_the_same_entries_give_the_same_files_in_any_order(entries, files):
-    assert site.files(sections(list(reversed(entries)))) == files
+def test_every_page_leads_home_to_the_board_to_submitting_and_to_the_source(page):
+    (line,) = re.findall(r'<nav class="site" aria-label="Site">(.*?)</nav>', page, re.DOTALL)
+    links = re.findall('href="([^"]*)">([^<]*)<', line)
+    assert links == [(LINKS["home"], "Home"), ("#/", "Board"), (LINKS["submit"], "Submit"),
+                     (LINKS["source"], "Source")]  # fmt: skip
 
 
-def test_placeholders_in_names_stay_as_they_are(tmp_path):
-    record = helpers_site.describe(helpers_site.make_record("riqn", reason="@style@"))
-    helpers_site.write_entry(tmp_path, "one", [record], caption="@script@ @data@")
-    page = page_of(read_entries(tmp_path))
-    assert embedded(page)["boards"][0]["rows"][0]["caption"] == "@script@ @data@"
+def test_links_lead_to_the_checkout_that_a_site_is_in(tmp_path, monkeypatch):
+    assert site.links(tmp_path / "my-board") == {}
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "docs" / "submitting.md").touch()
+    assert site.links(tmp_path / "leaderboard") == LINKS
+    found = site.links(tmp_path / "leaderboard" / "seasons" / "one")
+    assert found["submit"] == "../../../../docs/submitting.md"
+    monkeypatch.setattr(site, "repository", lambda: "https://example.org/x")
+    assert site.links(tmp_path)["submit"] == "https://example.org/x/blob/main/docs/submitting.md"
 
 
-def test_markup_in_an_entry_cannot_end_the_data(tmp_path):
-    evil = "</script><script>alert(1)</script><!-- <b> & \u2028"
-    helpers_site.write_entry(tmp_path, "one", [helpers_site.make_record()], caption=evil)
-    files = site.files(sections(read_entries(tmp_path)))
+def test_the_head_says_which_season_it_is_and_of_what_day(page, reported):
+    assert "<strong>Season 2026-11, 27 November 2026.</strong>" in page
+    assert "No season has been run yet" in site.files(reported)[site.PAGE]
+    trial = helpers_site.season(name="small", trial=True)
+    files = site.files((), (), [trial])
+    assert "A trial season: no board." in files[site.PAGE]
+    (board,) = embedded(files[site.PAGE])["boards"]
+    assert board["title"] == "Trial small: no board, since it lacks environments ant, arm"
+
+
+def test_the_newest_season_is_first_then_trials_then_reported_tables(reported, season):
+    older = helpers_site.season(name="2026-05", date="2026-05-20")
+    trial = helpers_site.season(name="small", date="2026-12-01", trial=True)
+    data, _ = site_data(reported, (), [trial, older, season])
+    assert [board["name"] for board in data["boards"]] == [
+        "Season 2026-11", "Season 2026-05", "Trial small",
+        "Reported: mini (abababab)", "Reported: mini (cdcdcdcd)",
+    ]  # fmt: skip
+    assert [board["notice"] for board in data["boards"]] == ["", "", "", REPORTED, REPORTED]
+
+
+def test_markup_and_placeholders_in_names_stay_text(tmp_path):
+    rng = np.random.default_rng(0)
+    records = helpers_site.row_records("mine", rng=rng, failed=helpers_site.CELLS[:1])
+    entry = helpers_site.Entry("mine", authors=EVIL, paper=EVIL, url=EVIL, licence=EVIL)
+    found = sections([helpers_site.report(tmp_path, "one", records)], {"mine": entry})
+    files = site.files(found)
     page = files[site.PAGE]
-    assert embedded(page)["boards"][0]["rows"][0]["caption"] == evil
-    assert "alert(1)" not in re.sub(r'<script type="application/json".*?</script>', "", page,
-                                    flags=re.DOTALL)  # fmt: skip
+    assert row(page, "mine")["authors"] == EVIL
+    assert part(files, "mine")["entry"]["licence"] == EVIL
+    markup = re.sub(r'<script type="application/json".*?</script>', "", page, flags=re.DOTALL)
+    assert "alert(1)" not in markup
     # As many elements as parts: data and script.
     assert page.count("<script") == page.count("</script>") == 2
-    assert part(files, "riqn")["entry"]["caption"] == evil
 
 
 @pytest.mark.parametrize("evil", ["'); alert(1); ('", "\\'); alert(1); //", "\\", "\n\u2028"])
@@ -130,9 +153,9 @@ def test_policy_names_the_only_style_and_script_by_digest(page):
 def test_nothing_is_fetched(page):
     markup = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
     addresses = re.findall(r'(?:src|href)="([^"]*)"', markup)
-    assert [a for a in addresses if not a.startswith("#/")] == [
-        "data:,", "../README.md", "cells.csv.gz", "https://arxiv.org/abs/2107.04982"
-    ]  # fmt: skip
+    assert {a for a in addresses if not a.startswith("#/")} == {
+        "data:,", "../README.md", "cells.csv.gz", *LINKS.values()
+    }  # fmt: skip
     assert not re.search(r"url\(|@import", markup)
 
 
@@ -152,166 +175,152 @@ def test_every_static_file_is_used():
 # -- the data -------------------------------------------------------------------------------------
 
 
-def test_boards_never_mix_digests(page):
-    boards = embedded(page)["boards"]
-    assert [b["digest"] for b in boards] == ["ab" * 32, "cd" * 32]
-    assert [[r["label"] for r in b["rows"]] for b in boards] == [
-        ["riqn", "riqn[h=10]", "rf", "persistence", "clock", "mine[window=3]"],
-        ["rf"],
-    ]
-    assert len({b["id"] for b in boards}) == 2
+def test_rows_have_the_ranks_and_tests_of_the_board(season, page):
+    rows = embedded(page)["boards"][0]["rows"]
+    assert [r["label"] for r in rows] == [str(s.entry) for s in season.ranks.standings]
+    for place, (found, standing) in enumerate(zip(rows, season.ranks.standings, strict=True)):
+        assert found["place"] == place
+        for name in ("rank", "equal", "band", "state", "variant", "origin", "authors", "year"):
+            assert found[name] == getattr(standing, name)
+        for name in ("above", "first"):
+            test = getattr(season.ranks, name).get(standing.entry)
+            assert (found[name] is None) == (test is None)
+            if test:
+                assert (found[name]["row"], found[name]["told"]) == (test.first, test.told)
+                ends = [found[name][end] for end in ("difference", "low", "high")]
+                assert ends == pytest.approx([test.difference, test.low, test.high], rel=1e-5)
+    assert row(page, "oracle")["rank"] is None
+    assert row(page, "broken")["state"] == "timeout in 2 of 8 cells"
+    assert {r["rank"] for r in embedded(page)["boards"][1]["rows"]} == {None}
 
 
-def test_rows_have_the_ranks_of_the_board(entries, page):
-    section = sections(entries)[0]
-    data = embedded(page)
-    for standing in section.ranks.standings:
-        found = row(data, str(standing.entry))
-        assert (found["rank"], found["ties"], found["state"]) == (
-            standing.rank, standing.ties, standing.state,
-        )  # fmt: skip
-    assert row(data, "mine[window=3]")["rank"] is None
-    assert row(data, "mine[window=3]")["state"] == "timeout in 2 of 8 cells"
-
-
-def test_a_row_says_what_it_is(page):
-    found = row(embedded(page), "riqn[h=10]")
-    assert (found["horizon"], found["inputs"], found["trivial"]) == (10, "observations+actions", 0)
+def test_a_row_says_what_it_is_and_where_it_is_from(files, page):
+    found = row(page, "riqn")
+    assert (found["seeds"], found["inputs"]) == ([0, 1, 2], "observations")
     assert found["cost"] == {"fit": 2.5, "step": 50, "peak": 150}
-    assert found["caption"] == "Three members instead of five."
-    assert row(embedded(page), "clock")["trivial"] is True
-    assert row(embedded(page), "rf")["seeds"] == [0, 1]
+    assert found["seed_means"][0] < found["means"]["*|*"][0][2] / 1000 < found["seed_means"][1]
+    entry = part(files, "mine")["entry"]
+    assert (entry["requirement"], entry["sha256"], entry["licence"]) == (
+        "mine-1.2-py3-none-any.whl", "12" * 32, "MIT",
+    )  # fmt: skip
+    board = embedded(page)["boards"][0]
+    assert board["season"]["bits"] == "0123456789abcdef" * 2
+    assert board["season"]["installed"]["mine"][0]["version"] == "1.2"
+    assert part(files, "riqn", 1)["entry"]["reported"] == "forecasters"
+    assert row(page, "riqn[h=10]", 1)["variant"] is True
 
 
-def test_cells_hold_values_and_intervals_in_the_order_of_the_metrics(entries, files):
-    data = embedded(files[site.PAGE])
-    board = data["boards"][0]
-    (entry,) = [e for e in entries if e.meta.id == "third-party"]
-    by_cell = {(r.environment, r.anomaly): r for r in entry.records}
-    cells = part(files, "mine[window=3]")["cells"]
-    assert [(c["environment"], c["anomaly"]) for c in cells] == [
-        (e, a) for e in ENVIRONMENTS for a in TABLE1 if (e, a) in by_cell
-    ]
-    for cell in cells:
-        record = by_cell[cell["environment"], cell["anomaly"]]
-        if not record.ok:
-            assert (cell["status"], cell["reason"]) == ("timeout", "not done after 5 s")
-            assert "values" not in cell
-            continue
-        for i, metric in enumerate(board["metrics"]):
-            assert cell["values"][i] == pytest.approx(record.value(metric), rel=1e-4)
-        for i, metric in enumerate(board["intervals"]):
-            shown = [printed(cell[end][i], metric) for end in ("low", "high")]
-            one = record.metrics[metric]
-            assert shown == [printed(end, metric) for end in (one.low, one.high)]
+def test_the_worst_environment_is_the_boards(season, page):
+    board = season.ranks.board
+    for standing in season.ranks.standings:
+        found = row(page, str(standing.entry))["worst"]
+        means = {
+            e: board.mean(standing.entry, [e], board.anomalies, "auc_matched").value
+            for e in board.environments
+        }
+        defined = {e: value for e, value in means.items() if not np.isnan(value)}
+        worst = min(defined, key=defined.get)
+        assert found == {"environment": worst, "value": pytest.approx(defined[worst], rel=1e-5)}
 
 
-def test_the_index_has_means_and_intervals_as_they_are_printed(entries, page):
-    board = sections(entries)[0].ranks.board
+def test_the_index_has_means_and_intervals_as_they_are_printed(season, page):
+    board = season.ranks.board
     data = embedded(page)["boards"][0]
-    groups = {"all": board.anomalies, **{g: board.in_group(g) for g in ("sensor", "dynamics")}}
-    for standing in sections(entries)[0].ranks.standings:
-        found = row(embedded(page), str(standing.entry))["means"]
+    groups = {"*": board.anomalies, **{f"*{g}": board.in_group(g) for g in board.groups}}
+    assert set(groups) == {"*", "*sensor", "*dynamics"}
+    for standing in season.ranks.standings:
+        found = row(page, str(standing.entry))["means"]
         for group, anomalies in groups.items():
             for i, metric in enumerate(data["metrics"]):
                 units = 10 if metric_info(metric).unit == "steps" else 1000
                 value = board.mean(standing.entry, board.environments, anomalies, metric)
-                shown = found[group][0][i]
+                shown = found[f"*|{group}"][0][i]
                 shown = None if shown is None else shown / units
                 assert printed(shown, metric) == printed(value.value, metric)
 
 
-def test_the_part_of_a_metric_has_every_cell(entries, files):
-    board = sections(entries)[0].ranks.board
-    data = embedded(files[site.PAGE])["boards"][0]
-    for metric in ("auc_matched", "delay"):
-        found = helpers_site.read_part(files, data["parts"][metric])
-        for standing in sections(entries)[0].ranks.standings:
-            own = found["values"][row(embedded(files[site.PAGE]), str(standing.entry))["part"]]
-            for (environment, anomaly), value in zip(data["cells"], own, strict=True):
-                mean = board.mean(standing.entry, [environment], [anomaly], metric)
-                expected = None if mean.state else pytest.approx(mean.value, rel=1e-5)
-                assert value == expected
-
-
-def test_intervals_of_selections_are_the_boards(entries, files):
-    board = sections(entries)[0].ranks.board
-    data = embedded(files[site.PAGE])
+def test_parts_have_every_cell_and_the_intervals_of_every_selection(season, files, page):
+    board = season.ranks.board
+    data = embedded(page)["boards"][0]
     compared = 0
-    for standing in sections(entries)[0].ranks.standings:
-        found = part(files, str(standing.entry))["intervals"]
+    for metric, standing in [
+        (metric, standing)
+        for metric in ("auc_matched", "delay", "false_episodes_at_5pct")
+        for standing in season.ranks.standings
+    ]:
+        found = helpers_site.read_part(files, data["parts"][metric])
+        name = row(page, str(standing.entry))["part"]
+        own = part(files, str(standing.entry))
+        assert found["values"][name] == own["values"][data["metrics"].index(metric)]
+        for (environment, anomaly), value in zip(data["cells"], found["values"][name], strict=True):
+            mean = board.mean(standing.entry, [environment], [anomaly], metric)
+            assert value == (None if mean.state else pytest.approx(mean.value, rel=1e-5))
+        place = data["intervals"].index(metric)
         for environments, anomalies, key in [
-            (board.environments, board.anomalies, "all|all"),
-            (board.environments, board.in_group("sensor"), "all|sensor"),
-            (["hopper"], board.anomalies, "hopper|all"),
-            (["hopper"], board.anomalies, "bullet|all"),
-            (["cartpole"], board.in_group("dynamics"), "cartpole|dynamics"),
-            (board.environments, ["gravity"], "all|gravity"),
-            (["hopper"], ["gravity"], "hopper|gravity"),
+            (board.environments, board.anomalies, "*|*"),
+            (["hopper"], board.anomalies, "hopper|*"),
+            (["cartpole"], board.in_group("dynamics"), "cartpole|*dynamics"),
+            (board.environments, ["gravity"], "*|gravity"),
         ]:
-            summary = key in ("all|all", "all|sensor", "all|dynamics")
-            for metric in ("auc_matched", *(("delay", "far_twin") if summary else ())):
-                value = board.mean(standing.entry, environments, anomalies, metric, intervals=True)
-                if value.state or value.cells == 1:
-                    assert key not in found
-                else:
-                    shown = found[key][data["boards"][0]["intervals"].index(metric)]
-                    ends = [printed(end, metric) for end in (value.low, value.high)]
-                    assert [printed(end, metric) for end in shown] == ends
-                    compared += 1
-    assert compared > 50
-    assert "hopper|gravity" in part(files, "rf")["intervals"]
+            value = board.mean(standing.entry, environments, anomalies, metric, intervals=True)
+            if value.state or (metric == "delay" and key != "*|*"):
+                continue
+            ends = [printed(end, metric) for end in (value.low, value.high)]
+            for pair in (own["intervals"][key][place], found["intervals"][name][key]):
+                assert [printed(end, metric) for end in pair] == ends
+                compared += 1
+    assert compared > 80
 
 
 def test_selections_are_those_that_the_filters_can_make():
-    cells = [(e, a) for e in ("ant", "hopper") for a in ("iid", "gravity")]
-    found = selections(cells)
+    cells = [("ant", "iid"), ("ant", "gravity"), ("tank", "leak")]
+    found = selections(cells, {"iid": "sensor", "gravity": "dynamics"})
     assert set(found) == {
-        f"{e}|{g}"
-        for e in ("all", "bullet", "ant", "hopper")
-        for g in ("all", "sensor", "dynamics", "iid", "gravity")
-    }  # fmt: skip
-    assert found["hopper|sensor"] == [("hopper", "iid")]
-    assert found["all|all"] == cells
-    found = selections([("ant", "iid"), ("hopper", "gravity")])  # those without cells are left out
-    assert "ant|dynamics" not in found
-    assert found["all|dynamics"] == [("hopper", "gravity")]
+        *("*|*", "*|*sensor", "*|*dynamics", "*|iid", "*|gravity", "*|leak"),
+        *("ant|*", "ant|*sensor", "ant|*dynamics", "ant|iid", "ant|gravity"),
+        *("tank|*", "tank|leak"),
+    }
+    assert found["*|*"] == cells
+    assert found["ant|*"] == cells[:2]
+
+
+def test_names_of_plugins_environments_and_strengths_are_shown(page):
+    data, _ = site_data((), (), [helpers_site.season()])
+    (board,) = data["boards"]
+    assert board["environments"] == {"cartpole": "CartPole", "hopper": "Hopper"}
+    assert board["anomalies"]["gravity"]["group"] == "dynamics"
+    assert set(board["strengths"].values()) == {""}
 
 
 def test_damaged_curves_are_named(tmp_path):
     record = helpers_site.make_record()
-    helpers_site.write_entry(tmp_path, "one", [record], curves=("riqn",))
+    found = helpers_site.report(tmp_path, "one", [record], curves=("riqn",))
     file = tmp_path / "one" / "curves.json"
     file.write_text(file.read_text().replace('"tpr":[', '"tpr":[7,'))
     with pytest.raises(ResultsError, match=r"units\[0\].roc.tpr"):
-        page_of(read_entries(tmp_path))
+        site.files(sections([found]))
 
 
 def test_every_metric_of_the_page_is_explained(page):
     data = embedded(page)
     for board in data["boards"]:
-        for metric in (*board["metrics"], *board["intervals"]):
+        assert set(board["intervals"]) <= set(board["metrics"])
+        for metric in board["metrics"]:
             assert data["metrics"][metric]["meaning"]
             assert data["metrics"][metric]["title"][0].isupper()
-    assert set(data["boards"][0]["intervals"]) <= set(WITH_INTERVALS)
-    assert set(WITH_INTERVALS) <= set(NAMES)
 
 
-def test_the_papers_digits_are_those_of_its_table(page):
-    paper = embedded(page)["paper"]
-    assert paper["acrobot"]["auc"]["sensor"]["rf"] == 79.16
-    assert set(paper) == set(ENVIRONMENTS)
-
-
-def test_weaker_anomalies_have_a_table_and_a_line_a_row(entries, graded):
-    (power,) = embedded(site.files(sections(entries), graded)[site.PAGE])["power"]
-    assert power["split"].startswith("mini")
-    overview = power["tables"][0]
-    assert [line[0] for line in overview["rows"]] == ["rf", "riqn", "clock"]
-    assert [row["label"] for row in power["rows"]] == ["rf", "riqn", "clock"]
-    assert [row["trivial"] for row in power["rows"]] == [False, False, True]
+def test_suites_have_tables_and_of_graded_strengths_a_line_a_row(tmp_path):
+    suites = helpers_site.graded(tmp_path)
+    (suite,) = embedded(site.files((), suites)[site.PAGE])["suites"]
+    assert suite["split"].startswith("mini")
+    labels = [line[0] for line in suite["tables"][0]["rows"]]
+    assert [row["label"] for row in suite["rows"]] == labels
+    assert {row["label"]: row["trivial"] for row in suite["rows"]} == {
+        "rf": False, "riqn": False, "clock": True,
+    }  # fmt: skip
     rungs = rungs_of("cartpole", "iid")
-    for row in power["rows"]:
+    for row in suite["rows"]:
         first, last = helpers_site.GRADED_ROWS[row["label"]]
         found, matched = row["points"]
         assert [point[0] for point in found] == pytest.approx(
@@ -319,48 +328,29 @@ def test_weaker_anomalies_have_a_table_and_a_line_a_row(entries, graded):
         )
         assert (found[0][2], found[-1][2]) == (first, last)
         assert {point[2] for point in matched} == {0.5}
-        lost = [1 - rung.kept for rung in rungs.values() if rung.kept == rung.kept]
-        assert [p[1] for p in found if p[1] is not None] == pytest.approx(lost, abs=1e-3)
-    assert embedded(page_of(entries))["power"] == []
 
 
-def test_undefined_values_are_null_and_a_board_on_which_everything_failed_has_its_metrics(tmp_path):
+def test_undefined_values_are_null_and_a_table_on_which_everything_failed_has_metrics(tmp_path):
     record = helpers_site.make_record(values={"delay": [None, None]})
-    helpers_site.write_entry(tmp_path / "some", "one", [record])
-    data, parts = site_data(sections(read_entries(tmp_path / "some")))
+    data, parts = site_data(sections([helpers_site.report(tmp_path, "one", [record])]))
     index = data["boards"][0]["metrics"].index("delay")
     (line,) = data["boards"][0]["rows"]
-    assert parts[line["part"]]["cells"][0]["values"][index] is None
-    assert line["means"]["all"][0][index] is None
+    assert parts[line["part"]]["values"][index] == [None]
+    assert line["means"]["*|*"][0][index] is None
     record = helpers_site.make_record(status="oom", reason="needed 9 GB")
-    helpers_site.write_entry(tmp_path / "none", "one", [record])
-    data, _ = site_data(sections(read_entries(tmp_path / "none")))
+    data, _ = site_data(sections([helpers_site.report(tmp_path, "two", [record])]))
+    assert data["boards"][0]["rows"][0]["failed"] == [[0, "oom", "needed 9 GB"]]
     usual = [name for name, info in METRICS.items() if info.cells != "unpaired"]
     assert data["boards"][0]["metrics"] == usual
-    assert set(usual) == set(data["metrics"])
-
-
-def test_an_entry_says_its_source(tmp_path):
-    record = helpers_site.make_record()
-    named = {"distribution": "oodd-eval", "plugin": "riqn", "version": "1"}
-    plugins = [
-        {"distribution": "oodd-x", "plugin": "x", "version": "2", "source_digest": "ef" * 32},
-        named | {"source_digest": "12" * 32},
-    ]
-    root = tmp_path / "results"
-    helpers_site.write_entry(root, "one", [record], plugins=plugins)
-    files = site.files(sections(read_entries(root)))
-    assert REPORTED in files[site.PAGE]
-    found = part(files, "riqn")
-    assert found["entry"]["source_digest"] == "12" * 32
 
 
 # -- curves as the page keeps them ----------------------------------------------------------------
 
 
-def test_curves_are_those_of_the_entry_to_a_pixel(entries, files):
-    units = read_curves(entries[0].curves)["units"]
-    kept = part(files, "riqn")["curves"]
+def test_curves_are_those_of_the_entry_to_a_pixel(reported, files):
+    source = next(s for s in reported[0].sources.values() if s.curves)
+    units = read_curves(source.curves)["units"]
+    kept = part(files, "riqn", 1)["curves"]
     compared = 0
     for unit in (unit for unit in units if unit["cell"].endswith("::riqn[h=1,seed=0]")):
         cell, example = kept[f"{unit['environment']}/{unit['anomaly']}"], unit["example"]
@@ -422,4 +412,4 @@ def test_sensors_of_shown_episodes_are_the_splits():
 
 def test_no_sensors_of_a_split_that_is_not_in_the_package(page):
     assert shipped_split("ab" * 32) is None
-    assert embedded(page)["boards"][0]["episodes"] == {}
+    assert embedded(page)["boards"][1]["episodes"] == {}

@@ -1,4 +1,4 @@
-"""The site in a real browser, opened from disk: sorting, filters, keyboard, a detector's page."""
+"""The site in a real browser, opened from disk: its first view, filters, keyboard, a row's page."""
 
 import itertools
 import time
@@ -6,30 +6,34 @@ import urllib.parse
 
 import helpers_site
 import pytest
+from helpers_docs import ROOT
 from oodd_leaderboard import site
 from oodd_leaderboard.curve_file import read_curves
-from oodd_leaderboard.reported import REPORTED, read_entries, sections
-from oodd_leaderboard.site.content import site_data
+from oodd_leaderboard.reported import REPORTED, Reported, sections
 
 from oodd_eval.data.facts import ANOMALIES
-from oodd_eval.metrics.catalogue import METRICS
-from oodd_eval.results.strengths import DETECTION
+from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.tables import show_value
 
 pytestmark = pytest.mark.browser
 
-LABELS = "#ranking tbody th a"
+LABELS = "#ranking tbody th > a"
+
+FIVE = ["Matched AUC", "Worst environment", "Found within 20", "Missed", "False episodes"]
+
+DASH = "\N{EN DASH}"
 
 
-def written(entries, directory, graded=()):
-    """Address of a site of some entries."""
-    return helpers_site.write_site(directory, site.files(sections(entries), graded))
+def written(directory, *boards):
+    """Address of a site of some boards."""
+    links = {name: f"../../{name}" for name in site.LINKS}
+    return helpers_site.write_site(directory, site.files(*boards, links=links))
 
 
 @pytest.fixture(scope="module")
-def url(entries, tmp_path_factory):
+def url(reported, season, tmp_path_factory):
     directory = tmp_path_factory.mktemp("site")
-    return written(entries, directory, helpers_site.graded(directory))
+    return written(directory, reported, helpers_site.graded(directory), [season])
 
 
 @pytest.fixture
@@ -48,8 +52,8 @@ def browser(window, url):
 
 
 def column_titles(browser):
-    return [t.removesuffix("↕").removesuffix("▲").removesuffix("▼").replace("\n", " ").strip()
-            for t in browser.texts("#ranking thead button")]  # fmt: skip
+    return [text.rstrip("↕▼▲").replace("\n", " ").strip()
+            for text in browser.texts("#ranking thead button")]  # fmt: skip
 
 
 def column(browser, title):
@@ -57,8 +61,7 @@ def column(browser, title):
     until = time.monotonic() + 10  # a column may need a data file that is loaded
     while title not in (titles := column_titles(browser)) and time.monotonic() < until:
         time.sleep(0.02)
-    index = titles.index(title) + 1
-    cells = browser.texts(f"#ranking tbody tr > :nth-child({index})")
+    cells = browser.texts(f"#ranking tbody tr > :nth-child({titles.index(title) + 1})")
     return dict(zip(browser.texts(LABELS), cells, strict=True))
 
 
@@ -72,103 +75,148 @@ def open_row(browser, label):
     browser.wait_for("document.querySelector('#detector h1') !== null")
 
 
-def unfold(browser):
-    """Show all rows of every detector."""
-    browser.run("document.querySelectorAll('.fold[aria-expanded=false]').forEach((b) => b.click())")
+def choose_board(browser, name):
+    browser.run(
+        "[...document.querySelectorAll('#boards label')].find((e) => e.innerText === arguments[0])"
+        ".querySelector('input').click()",
+        name,
+    )
+
+
+def open_view(browser, url, view):
+    """Open a page by its address; ``detector`` is the first row's."""
+    if view == "detector":
+        (row, *_) = browser.run(
+            "return [...document.querySelectorAll('[data-row]')].map(e => e.dataset.row)"
+        )
+        view = f"detector/{urllib.parse.quote(row, safe='')}"
+    browser.open("about:blank")
+    browser.open(f"{url}#/{view}")
+    shown = "[...document.querySelectorAll('main h1')].some((e) => e.checkVisibility())"
+    browser.wait_for(f"!document.querySelector('[aria-busy], [role=status]') && {shown}")
+
+
+# -- the first view -------------------------------------------------------------------------------
+
+
+def test_the_first_view_names_the_best_row_whose_it_is_when_and_how_to_take_part(browser, season):
+    assert browser.text("#head h1") == "Season 2026-11"
+    assert "Season 2026-11, 27 November 2026." in browser.text(".what")
+    test = season.ranks.first[next(s.entry for s in season.ranks.standings if s.rank == 2)]
+    headline = browser.text(".headline").replace("\N{MINUS SIGN}", "-")
+    assert headline.startswith("Best: riqn by Danesh, Fern (2021), Benchmarks <b>, matched AUC ")
+    assert f"It is told from the second, mine: the difference is {100 * test.difference:+.1f}" in (
+        headline
+    )
+    assert f"[{100 * test.low:+.1f}, {100 * test.high:+.1f}]" in headline
+    assert browser.texts("header nav a") == ["Home", "Board", "Submit", "Source"]
+    assert browser.texts("#boards label") == [
+        "Season 2026-11", "Reported: mini (abababab)", "Reported: mini (cdcdcdcd)",
+    ]  # fmt: skip
+    browser.click(".proof summary")
+    assert {"0123456789abcdef" * 2, "5e" * 32} <= set(browser.texts(".proof dd"))
+
+
+def test_rows_stand_in_the_boards_order_with_five_columns(browser, season):
+    standings = season.ranks.standings
+    assert browser.texts(LABELS) == [str(s.entry) for s in standings]
+    assert column_titles(browser) == ["Rank", "Detector", *FIVE]
+    expected = [f"{s.rank or DASH}{'=' * s.equal}" for s in standings]
+    assert browser.texts("#ranking tbody td.rank") == expected
+    assert browser.texts("tr.band th > a") == [str(s.entry) for s in standings if s.band]
+    assert browser.texts("tr.out th > a") == ["oracle", "broken"]
+    badges = ["oracle", "the paper\u2019s", "others\u2019", "ours", "trivial", "others\u2019"]
+    assert browser.texts("#ranking .badge") == badges
+    assert "Not ranked: timeout in 2 of 8 cells" in browser.texts("#ranking .under.state")
+
+
+def test_bold_are_the_best_of_ranked_rows_alone(browser, season):
+    assert browser.texts("tr.out strong") == []
+    board = season.ranks.board
+    means = {
+        str(s.entry): board.mean(s.entry, board.environments, board.anomalies, "auc_matched").value
+        for s in season.ranks.standings
+        if s.rank
+    }
+    best = max(means, key=means.get)
+    bold = browser.texts("#ranking tbody td:nth-child(3) strong")
+    assert bold == [f"{100 * means[best]:.1f}"]
+
+
+def test_with_one_environment_there_is_a_column_an_anomaly(browser):
+    browser.choose("environment", "Hopper")
+    kinds = ["IID", "Sensor Drift", "Gravity", "Agent's Components"]
+    browser.wait_for("document.querySelectorAll('#ranking thead th').length === 10")
+    assert column_titles(browser) == ["Rank", "Detector", FIVE[0], *kinds, *FIVE[2:]]
+    assert any("Ranks are those over all cells" in line for line in browser.texts("#notes li"))
+    assert browser.texts(".equal") == []
+
+
+def test_everything_else_is_behind_one_button(browser, season):
+    browser.click("#wide")
+    titles = column_titles(browser)
+    assert titles[2:7] == FIVE
+    metrics = {name for r in season.ranks.board.records for name in r.metrics}
+    assert len(titles) > len(metrics)
+    assert {"Smoothed AUC", "Placebo", "Lowest seed", "Fit", "Sensor anomalies"} <= set(titles)
+    assert browser.run("return document.activeElement.id") == "wide"
+    browser.press("enter")
+    assert column_titles(browser)[2:] == FIVE
+
+
+def test_a_reported_table_has_no_ranks_and_says_what_it_is(browser):
+    choose_board(browser, "Reported: mini (abababab)")
+    assert browser.text("#head h1") == "Reported: mini (abababab)"
+    assert browser.text("#head .notice") == REPORTED
+    assert column_titles(browser) == ["Detector", *FIVE]
+    assert browser.texts("#ranking strong") == []
+    assert browser.text(".headline").startswith("Highest reported mean: riqn")
+    assert "variant" in browser.texts("#ranking .badge")
+
+
+def test_a_trial_says_in_its_title_that_it_is_no_board(window, tmp_path):
+    trial = helpers_site.season(name="small", trial=True)
+    window.open(written(tmp_path, (), (), [trial]))
+    title = "Trial small: no board, since it lacks environments ant, arm"
+    assert window.text("#head h1") == title
 
 
 # -- the table ------------------------------------------------------------------------------------
 
 
-def test_the_first_view_is_the_ranking_of_the_first_board(browser):
-    assert browser.texts(LABELS) == ["riqn", "rf", "persistence", "clock", "mine[window=3]"]
-    assert "all environments, all anomalies (means over 8 cells; 6 rows)" in browser.text(
-        "#ranking caption"
-    )
-    assert "digest abababababab, protocol 1, 2 test seeds" in browser.texts("#notes li")[0]
-    assert browser.run("return document.querySelector('[aria-sort=descending]').textContent")
-
-
-def test_trivial_rows_are_marked_and_can_be_left_out(browser):
-    assert browser.texts("tr.trivial th a") == ["persistence", "clock"]
-    assert "trivial" in browser.texts("tr.trivial .badge")
-    browser.click("#filters [name=trivial]")
-    assert browser.texts(LABELS) == ["riqn", "rf", "mine[window=3]"]
-    assert "4 of 6 rows" in browser.text("#ranking caption")
-
-
 def test_a_click_sorts_and_a_second_one_turns_round(browser):
-    def order():
-        return browser.run(
-            "const h = document.querySelector('[data-sort=auc_placebo]').closest('th');"
-            "return h.getAttribute('aria-sort')"
-        )
-
-    assert order() == "none"
-    browser.click("[data-sort=auc_placebo]")
-    assert order() == "ascending"
-    values = [float(v) for v in column(browser, "Placebo").values() if v != "timeout"]
-    assert values == sorted(values)
-    browser.click("[data-sort=auc_placebo]")
-    assert order() == "descending"
-    turned = list(column(browser, "Placebo").values())
-    # What has no value stays last.
-    assert turned == [*map(str, sorted(values, reverse=True)), "timeout"]
+    order = "return document.querySelector('[data-sort=worst]').closest('th').ariaSort"
+    assert browser.run(order) == "none"
+    browser.click("[data-sort=worst]")
+    assert browser.run(order) == "descending"
+    values = [float(text.split()[0]) for text in column(browser, FIVE[1]).values()]
+    assert values == sorted(values, reverse=True)
+    browser.click("[data-sort=worst]")
+    assert [float(text.split()[0]) for text in column(browser, FIVE[1]).values()] == sorted(values)
 
 
-def test_every_column_of_every_view_sorts(browser):
-    seen = browser.run(
-        """
-        return (async () => {
-        const all = (selector) => [...document.querySelectorAll(selector)];
-        const found = [];
-        for (const view of all("[name=view]")) {
-          document.querySelector(`#filters [value=${view.value}]`).click();
-          while (document.querySelector("[aria-busy]")) {
-            await new Promise((done) => setTimeout(done, 10));
-          }
-          for (const button of all("[data-sort]")) {
-            const selector = `[data-sort="${button.dataset.sort}"]`;
-            document.querySelector(selector).click();
-            const order = document.querySelector(selector).closest("th").getAttribute("aria-sort");
-            found.push([view.value, order, all("#ranking tbody tr").length]);
-          }
-        }
-        return found;
-        })();
-        """
-    )
-    views = browser.run("return [...document.querySelectorAll('[name=view]')].map(e => e.value)")
-    assert views == [
-        "ranking", "aucs", "guaranteed", "alarms", "environments", "anomalies", "cost"
-    ]  # fmt: skip
-    assert all(sum(view == name for view, _, _ in seen) > 3 for name in views)
-    assert {order for _, order, _ in seen} == {"ascending", "descending"}
-    assert {rows for _, _, rows in seen} == {5}
-
-
-def test_the_keyboard_sorts_and_keeps_its_place(browser):
+def test_the_keyboard_sorts_reaches_every_control_and_opens_a_row(browser):
     browser.run("document.querySelector('[data-sort=label]').focus()")
     browser.press("enter")
     assert browser.texts(LABELS) == sorted(browser.texts(LABELS))
     assert browser.run("return document.activeElement.dataset.sort") == "label"
     browser.press("space")
     assert browser.texts(LABELS) == sorted(browser.texts(LABELS), reverse=True)
-
-
-def test_the_keyboard_reaches_every_control_and_opens_a_detector(browser):
+    browser.run("document.activeElement.blur(); scrollTo(0, 0)")
+    browser.click(".name a")
     seen = []
     for _ in range(40):
         browser.press("tab")
         seen.append(
             browser.run(
-                "const e = document.activeElement; return e.name || e.dataset.sort || e.textContent"
+                "const e = document.activeElement;"
+                "return e.name || e.id || e.dataset.sort || e.textContent"
             )
         )
-        if seen[-1] == "riqn":
+        if seen[-1] == "riqn" and "label" in seen:
             break
-    for control in ("search", "board", "environment", "group", "anomaly", "horizon", "inputs",
-                    "view", "trivial", "rank", "label", "auc_matched"):  # fmt: skip
+    for control in ("Submit", "board", "search", "environment", "anomaly", "wide", "rank",
+                    "label", "auc_matched"):  # fmt: skip
         assert control in seen
     browser.press("enter")
     browser.wait_for("document.querySelector('#detector h1') !== null")
@@ -180,86 +228,28 @@ def test_the_keyboard_reaches_every_control_and_opens_a_detector(browser):
     assert browser.run("return document.activeElement.textContent") == "riqn"
 
 
-def test_the_arrow_keys_choose_columns_and_filters(browser):
-    browser.run("document.querySelector('[name=view]:checked').focus()")
-    browser.press("right")
-    assert browser.text("#ranking caption").startswith("AUCs:")
-    assert browser.run("return document.activeElement.value") == "aucs"
-    browser.run("document.querySelector('[name=group]').focus()")
-    browser.press("down")
-    assert "sensor anomalies" in browser.text("#ranking caption")
-    assert browser.run("return document.activeElement.name") == "group"
-
-
-def test_means_and_intervals_are_the_boards_for_every_selection(browser, entries):
-    section = sections(entries)[0]
-    board = section.ranks.board
-    environments = {
-        "All environments": board.environments, "Bullet": ["hopper"], "CartPole": ["cartpole"],
-    }  # fmt: skip
-    groups = {"Both groups": board.anomalies, "Sensor": board.in_group("sensor"),
-              "Dynamics": board.in_group("dynamics")}  # fmt: skip
-    compared = 0
-    for (place, some), (group, members) in itertools.product(environments.items(), groups.items()):
+def test_means_and_intervals_are_the_boards_for_every_selection(browser, season):
+    board = season.ranks.board
+    environments = {"All environments": board.environments, "Hopper": ["hopper"]}
+    kinds = {
+        "All anomalies": board.anomalies,
+        "Sensor anomalies": board.in_group("sensor"),
+        **{ANOMALIES[a].title: [a] for a in ("iid", "gravity")},
+    }
+    columns = {"Matched AUC": "auc_matched", "False episodes": "false_episodes_at_5pct"}
+    for (place, some), (name, anomalies) in itertools.product(environments.items(), kinds.items()):
         browser.choose("environment", place)
-        browser.choose("group", group)
-        unfold(browser)
-        for name, chosen in {
-            "All anomalies": members,
-            ANOMALIES[members[0]].title: members[:1],
-        }.items():
-            browser.choose("anomaly", name)
-            found = column(browser, "Matched AUC")
-            for standing in section.ranks.standings:
-                value = board.mean(standing.entry, some, chosen, "auc_matched", intervals=True)
-                expected = show_value(value, "auc_matched").split(maxsplit=1)
+        browser.choose("anomaly", name)
+        for title, metric in columns.items():
+            found = column(browser, title)
+            for standing in season.ranks.standings:
+                value = board.mean(standing.entry, some, anomalies, metric, intervals=True)
+                expected = show_value(value, metric).split(maxsplit=1)
                 text = found[str(standing.entry)].replace("\n", " ").split(maxsplit=1)
                 assert text == expected
-                compared += 1
-    assert compared == 3 * 3 * 2 * 6
 
 
-def test_filters_of_rows_anomalies_and_boards(browser):
-    browser.choose("horizon", "Δ = 10")
-    assert browser.texts(LABELS) == ["riqn[h=10]"]
-    browser.choose("horizon", "All horizons")
-    browser.choose("inputs", "observations + actions")
-    assert browser.texts(LABELS) == ["riqn"]
-    unfold(browser)
-    assert browser.texts(LABELS) == ["riqn", "riqn[h=10]"]
-    # Anomalies to choose are those of the group.
-    browser.choose("group", "Sensor")
-    assert browser.texts("[name=anomaly] option") == ["All anomalies", "IID", "Sensor Drift"]
-    browser.choose("anomaly", "IID")
-    browser.choose("group", "Dynamics")
-    assert browser.run("return document.querySelector('[name=anomaly]').value") == "all"
-    # Ranks are those of all cells.
-    assert any("Ranks, tie groups and wins" in line for line in browser.texts("#notes li"))
-    browser.choose("group", "Both groups")
-    assert not any("Ranks" in line for line in browser.texts("#notes li"))
-    browser.choose("inputs", browser.texts("[name=inputs] option")[0])
-    browser.choose("board", "mini (cdcdcdcd), protocol 1")
-    assert browser.texts(LABELS) == ["rf"]
-    assert "digest cdcdcdcdcdcd" in browser.texts("#notes li")[0]
-
-
-def test_variants_stand_below_their_detectors_row(browser):
-    assert browser.texts(".fold") == ["+ 1 variant"]
-    browser.run("document.querySelector('.fold').focus()")
-    browser.press("enter")
-    assert browser.texts(LABELS)[:3] == ["riqn", "riqn[h=10]", "rf"]
-    state = "return document.activeElement.getAttribute('aria-expanded')"
-    assert browser.run(state) == "true"
-    browser.click("[data-sort=label]")
-    browser.click("[data-sort=label]")
-    assert browser.texts(LABELS)[:3] == ["riqn", "riqn[h=10]", "rf"]
-    browser.run("document.querySelector('.fold').focus()")
-    browser.press("enter")
-    assert browser.run(state) == "false"
-    assert "riqn[h=10]" not in browser.texts(LABELS)
-
-
-def test_search_finds_names_plugins_and_submitters(browser):
+def test_search_finds_names_authors_and_papers(browser):
     def search(text):
         browser.run(
             "const field = document.querySelector('[name=search]'); field.value = arguments[0];"
@@ -268,93 +258,53 @@ def test_search_finds_names_plugins_and_submitters(browser):
         return browser.texts(LABELS)
 
     assert search("RIQ") == ["riqn"]
-    assert search("nonymous") == ["riqn", "rf", "persistence", "clock", "mine[window=3]"]
+    assert search("eve") == ["mine", "rf"]
+    assert search("benchmarks") == ["riqn"]
     assert search("no such") == []
-    assert search("") != []
 
 
-def test_the_table_as_csv_has_its_rows_and_no_formulas(browser):
+def test_the_table_as_csv_has_its_rows(browser):
     lines = browser.run(
         """
         let text;
         window.Blob = class { constructor(parts) { text = parts.join(""); } };
         URL.createObjectURL = () => "#/";
-        document.querySelector("#filters .action").click();
+        [...document.querySelectorAll("#filters .action")].at(-1).click();
         return text.trim().split("\\n");
         """
     )
-    assert lines[0].startswith("Rank")
-    assert len(lines) == 6
-    assert lines[1].startswith("1")
-    assert ",riqn" in lines[1]
+    assert lines[0].startswith("Rank,Detector,Matched AUC")
+    assert len(lines) == 7
+    assert lines[2].startswith("1,riqn,")
 
 
-def test_failures_are_states_with_a_reason(browser):
-    assert column(browser, "Matched AUC")["mine[window=3]"] == "timeout"
-    notes = browser.texts("#notes li")
-    assert any("Not ranked: mine[window=3], timeout in 2 of 8" in note for note in notes)
-    assert browser.run("return document.querySelector('td.state').title") == "not done after 5 s"
-    browser.choose("group", "Dynamics")
-    assert column(browser, "Matched AUC")["mine[window=3]"] != "timeout"
-
-
-def test_the_papers_digits_stand_in_a_column_of_their_own(browser):
-    browser.choose("environment", "CartPole")
-    browser.choose("group", "Sensor")
-    browser.click("#filters [value=aucs]")
-    found = column(browser, "Paper’s AUC")  # noqa: RUF001
-    paper = site_data([])[0]["paper"]["cartpole"]["auc"]["sensor"]
-    assert found["riqn"] == f"{paper['riqn']:.1f}"
-    assert found["rf"] == f"{paper['rf']:.1f}"
-    # They are at horizon 1 and with the paper's settings.
-    assert found["clock"] == "–"  # noqa: RUF001
-    unfold(browser)
-    assert column(browser, "Paper’s AUC")["riqn[h=10]"] == "–"  # noqa: RUF001
-
-
-def test_the_cost_does_not_depend_on_what_is_selected(browser):
-    browser.click("#filters [value=cost]")
-    assert [column(browser, t)["riqn"] for t in ("Fit", "Score", "Peak memory")] == [
-        "2.5", "50", "150"
-    ]  # fmt: skip
-    browser.choose("environment", "Hopper")
-    assert (
-        browser.text("#ranking caption") == "Cost: all fits of a row, whatever is selected (6 rows)"
-    )
-
-
-def test_the_address_says_what_is_shown(browser, url):
+def test_the_address_says_what_is_shown(browser):
     assert browser.run("return location.hash") == "#/"
+    choose_board(browser, "Reported: mini (abababab)")
     browser.choose("environment", "Hopper")
-    browser.choose("group", "Sensor")
-    browser.click("#filters [value=alarms]")
-    browser.click("[data-sort=missed]")
-    browser.click("#filters [name=trivial]")
+    browser.choose("anomaly", "Sensor anomalies")
+    browser.click("[data-sort^=missed]")
     address, caption = browser.run("return location.href"), browser.text("#ranking caption")
     labels = browser.texts(LABELS)
-    assert sorted(labels) == ["mine[window=3]", "rf", "riqn"]
     browser.open("about:blank")
     browser.open(address)
+    browser.wait_for("document.querySelector('#ranking') !== null")
     assert (browser.text("#ranking caption"), browser.texts(LABELS)) == (caption, labels)
-    assert browser.run("return document.querySelector('[name=trivial]').checked") is False
     # Back from a row, the table is as it was left; the name of the site leads to the first view.
     open_row(browser, "rf")
     browser.click(".back a")
     browser.wait_for("document.querySelector('#detector').hidden")
     assert browser.text("#ranking caption") == caption
-    browser.click("header a")
-    expected = "Separability: all environments, all anomalies"
-    browser.wait_for(
-        "location.hash === '#/'"
-        f"&& document.querySelector('#ranking caption').textContent.startsWith('{expected}')"
-    )
+    browser.click(".name a")
+    browser.wait_for("location.hash === '#/'")
+    assert browser.text("#head h1") == "Season 2026-11"
 
 
 @pytest.mark.parametrize(
     "wrong",
     [
-        *("?view=constructor&board=none&sort=<b>&horizon=1e9&trivial=", "?group=__proto__"),
-        *("?anomaly=gravity&group=sensor", "?%E0%A4%A", "detector/nobody", "<b>"),
+        "?board=none&sort=<b>&wide=&environment=constructor",
+        *("?anomaly=__proto__", "?%E0%A4%A", "detector/nobody", "compare/a/b", "<b>"),
     ],
 )
 def test_an_address_that_asks_for_what_is_not_there_is_a_table(browser, url, wrong):
@@ -364,347 +314,133 @@ def test_an_address_that_asks_for_what_is_not_there_is_a_table(browser, url, wro
     assert browser.run("return document.querySelector('#detector').hidden")
 
 
-def test_a_columns_meaning_stands_above_the_table(browser):
-    assert METRICS["auc_matched"].summary in browser.text("#meaning")
-    # The column under the focus, which the keyboard moves, or under the pointer, as a tooltip, too.
-    browser.run("document.querySelector('[data-sort=auc_matched]').focus()")
-    browser.press("tab", "tab", "tab")
-    assert browser.text("#meaning").startswith("Smoothed AUC (%, higher is better): ")
-    assert METRICS["auc_smoothed"].summary in browser.text("#meaning")
-    for button, metric in (("auc_placebo", "auc_placebo"), ("auc", "auc")):
-        title = browser.run(f"return document.querySelector('[data-sort={button}]').title")
-        assert title == METRICS[metric].summary
-    browser.run("document.activeElement.blur()")
-    assert browser.text("#meaning").startswith("Matched AUC")
-    browser.click(".meaning + .reading summary")
-    meanings = browser.texts("#meanings li")
-    titles = [line.partition(" (")[0].partition(":")[0] for line in meanings]
-    assert titles == column_titles(browser)
-    assert browser.text(".what").endswith(REPORTED)
-    assert browser.texts("#ranking .badge") == ["trivial", "trivial"]
+# -- the page of a row ----------------------------------------------------------------------------
 
 
-# -- the page of a detector -----------------------------------------------------------------------
-
-
-def test_a_detectors_page_has_its_cells_and_curves(browser):
-    open_row(browser, "riqn")
+def test_a_rows_page_has_its_tests_cells_and_source(browser, season):
+    open_row(browser, "mine")
+    above = season.ranks.above[next(s.entry for s in season.ranks.standings if s.rank == 2)]
+    lines = [line.replace("\N{MINUS SIGN}", "-").split("\t")
+             for line in browser.texts("#tested tbody tr")]  # fmt: skip
+    interval = f"[{100 * above.low:+.1f}, {100 * above.high:+.1f}]"
+    assert lines[0][1:] == [f"{100 * above.difference:+.1f}", interval, "told apart"]
+    assert lines[1][0] == "the first, riqn"
+    # A name of a stranger is text, and the address of a script no link.
+    assert browser.run("return document.querySelectorAll('main b').length") == 0
+    facts = browser.texts("#source dd")
+    assert {"<b>Eve</b>", "javascript:alert(1)", "mine-1.2-py3-none-any.whl", "12" * 32} <= {*facts}
+    assert browser.run("return document.querySelectorAll('#source a').length") == 0
+    assert "mine 1.2, SHA-256 121212121212" in facts
     headers = [text.replace("\n", " ") for text in browser.texts(".heat thead [scope=col]")]
     assert headers[1:] == ["IID", "Sensor Drift", "Gravity", "Agent's Components", "Mean"]
-    assert len(browser.texts(".heat td a")) == 8
-    assert browser.text("#cell h2") == "CartPole, IID"
-    assert len(browser.texts("#cell figure")) == 3
-    titles = browser.run(
-        "const drawn = [...document.querySelectorAll('#cell svg[role=img]')];"
-        "return drawn.map(e => e.getAttribute('aria-label'))"
-    )
-    assert titles == [
-        "ROC curve",
-        "Delay against false-alarm rate",
-        "Missed trajectories against false-alarm rate",
-        "Scores",
-        "CUSUM statistic and alarms",
-    ]
-    assert "against" in browser.text("#cell > p")
-    assert "from false alarms alone" in browser.text("#cell > p")
-    browser.click(".back a")
-    browser.wait_for("document.querySelector('#detector').hidden")
-    open_row(browser, "clock")
     assert any("no curves for this cell" in t for t in browser.texts("#cell .note"))
+    browser.run("document.querySelectorAll('.heat td a')[7].focus()")
+    browser.press("enter")
+    browser.wait_for("document.querySelector('#cell h2').textContent.startsWith('Hopper')")
+    assert browser.text("#cell h2") == "Hopper, Agent's Components"
+    # The keyboard stays where it was.
+    assert browser.run("return document.activeElement.getAttribute('aria-current')") == "true"
+    browser.run("history.back()")
+    browser.run("history.back()")
+    browser.wait_for("document.querySelector('#detector').hidden")
+    link = "return document.querySelector('[data-row$=riqn] .under a').outerHTML"
+    assert 'href="https://example.org/page" rel="noopener noreferrer external"' in browser.run(link)
 
 
-def test_curves_are_drawn_from_the_entrys_numbers(browser, entries):
-    units = read_curves(entries[0].curves)["units"]
+def test_heat_shows_every_cell_of_a_row(browser, season):
+    board = season.ranks.board
+    open_row(browser, "rf")
+    (rf,) = [s.entry for s in season.ranks.standings if str(s.entry) == "rf"]
+    shown = iter(browser.texts(".heat tbody td"))
+    for some in [*([e] for e in board.environments), board.environments]:
+        for anomalies in [*([a] for a in board.anomalies), board.anomalies]:
+            value = board.mean(rf, some, anomalies, "auc_matched")
+            assert next(shown) == show_value(value, "auc_matched")
+
+
+def test_curves_are_drawn_from_what_is_reported_and_played(browser, reported):
+    source = next(s for s in reported[0].sources.values() if s.curves)
+    units = read_curves(source.curves)["units"]
     (unit,) = [u for u in units if u["cell"].startswith("mini/hopper/gravity::riqn[h=1,")]
+    choose_board(browser, "Reported: mini (abababab)")
     open_row(browser, "riqn")
+    assert "Table 5" in browser.text("#paper caption")
     browser.run("location.hash += '/hopper/gravity'")
     browser.wait_for("document.querySelector('#cell h2').textContent === 'Hopper, Gravity'")
     example = unit["example"]
     assert len(browser.texts(".alarms.anomalous line")) == len(example["alarms"])
     assert len(browser.texts(".alarms.twin line")) == len(example["twin_alarms"])
     assert f"onset τ = {example['onset']}" in browser.texts(".onset text")
-    assert f"Test trajectory {example['index']}," in browser.texts("#detector figcaption")[2]
-    first = next(t for t in example["alarms"] if t >= example["onset"]) - example["onset"]
-    when = "at the onset" if first == 0 else f"{first} step{'s' * (first > 1)} after the onset"
-    assert f"anomalous {when}" in browser.texts("#detector figcaption")[2]
     # Every point of the ROC curve, and its corner, is on the line.
     path = browser.run("return document.querySelector('#cell .line.anomalous').getAttribute('d')")
     assert path.count("L") == len(unit["roc"]["fpr"])
-    browser.run("document.querySelectorAll('#cell details')[1].open = true")
-    table = browser.texts("#cell details[open] tbody tr")
-    assert len(table) == len(unit["delay_far"]["far"])
-
-
-def test_choosing_a_cell_shows_it(browser):
-    open_row(browser, "riqn")
-    browser.run("document.querySelectorAll('.heat td a')[7].focus()")
-    browser.press("enter")
-    browser.wait_for("document.querySelector('#cell h2').textContent.startsWith('Hopper')")
-    assert browser.text("#cell h2") == "Hopper, Agent's Components"
-    assert browser.run("return document.querySelectorAll('.heat [aria-current]').length") == 1
-    # The keyboard stays where it was.
-    assert browser.run("return document.activeElement.getAttribute('aria-current')") == "true"
-
-
-def test_heat_shows_every_cell_of_a_row(browser, entries):
-    section = sections(entries)[0]
-    board = section.ranks.board
-    open_row(browser, "rf")
-    (rf,) = [s.entry for s in section.ranks.standings if str(s.entry) == "rf"]
-    shown = iter(browser.texts(".heat tbody td"))
-    everything = [*([e] for e in board.environments), board.environments]
-    for some in everything:
-        for anomalies in [*([a] for a in board.anomalies), board.anomalies]:
-            value = board.mean(rf, some, anomalies, "auc_matched")
-            assert next(shown) == show_value(value, "auc_matched")
-
-
-def test_comparisons_name_every_other_ranked_row(browser, entries):
-    ranking = sections(entries)[0].ranks.ranking
-    open_row(browser, "rf")
-    rows = browser.texts("#comparisons tbody tr")
-    expected = [c for c in ranking.comparisons if c.first == "rf"]
-    assert len(rows) == len(expected) == 4
-    for c in expected:
-        (text,) = [r for r in rows if r.split("\t")[0] == c.second]
-        back = next(b for b in ranking.comparisons if (b.first, b.second) == (c.second, "rf"))
-        verdict = "better" if c.better else "worse" if back.better else "not told apart"
-        assert text.split("\t")[3] == verdict
-        printed = text.split("\t")[1].replace("−", "-")  # noqa: RUF001
-        assert float(printed) == pytest.approx(100 * c.difference, abs=0.051)
-
-
-def test_the_papers_table_stands_beside_ours_where_it_has_digits(browser):
-    open_row(browser, "rf")
-    assert "Table 5" in browser.text("#paper caption")
-    assert len(browser.texts("#paper tbody tr")) == 3
-    browser.run("history.back()")
-    browser.wait_for("document.querySelector('#detector').hidden")
-    unfold(browser)
-    open_row(browser, "riqn[h=10]")
-    assert browser.texts("#paper") == []
-
-
-def test_names_and_notes_are_text_and_links_lead_out_only_when_followed(browser):
-    open_row(browser, "mine[window=3]")
-    assert "<b>bold</b>" in browser.texts("#source h3")
-    assert browser.run("return document.querySelectorAll('#source b').length") == 0
-    # An address of a script is shown, not linked.
-    assert "javascript:alert(1)" in browser.texts("#source dd")
-    link = "const a = document.querySelector('#source a'); return a && [a.href, a.rel]"
-    assert browser.run(link) is None
-    browser.run("history.back()")
-    browser.wait_for("document.querySelector('#detector').hidden")
-    open_row(browser, "riqn")
-    assert browser.run(link) == ["https://example.org/page", "noopener noreferrer external"]
-    text = browser.text(".bibtex")
-    assert text.startswith("@misc{oodd-eval-forecasters,")
-    assert "author = {{A. Nonymous}}" in text
-    assert "Page 1954" in text
-
-
-@pytest.mark.parametrize("before", ["/hopper/iid", ""])
-def test_another_cell_of_a_row_makes_the_page_that_its_address_opens(browser, url, before):
-    content = """
-        const page = document.querySelector("#detector");
-        return [page.textContent, page.querySelector(".heat [aria-current]").href];
-        """
-    open_row(browser, "riqn")
-    address = browser.run("return location.hash")
-    browser.open("about:blank")
-    browser.open(f"{url}{address}/hopper/drift")
-    opened = browser.run(content)
-    browser.open("about:blank")
-    browser.open(url + address + before)
-    assert browser.text("#cell h2") != "Hopper, Sensor Drift"
-    browser.run("document.querySelector('#metrics').dataset.seen = 'yes'")
-    browser.run("location.hash = arguments[0]", f"{address}/hopper/drift")
-    browser.wait_for("document.querySelector('#cell h2').textContent === 'Hopper, Sensor Drift'")
-    assert browser.run(content) == opened
-    assert browser.run("return document.querySelector('#metrics').dataset.seen") == "yes"
-
-
-# -- weaker anomalies -----------------------------------------------------------------------------
-
-
-def test_weaker_anomalies_are_drawn_over_strength_and_over_their_cost(browser):
-    browser.run("location.hash = '#/power'")
-    browser.wait_for("document.querySelector('#power') !== null")
-    assert browser.texts("#power .legend li") == ["rf", "riqn", "trivial rows"]
-    assert browser.texts("#power tbody tr th")[:3] == ["rf", "riqn", "clock"]
-    paths = "return [...document.querySelectorAll('#power path')].map((p) => p.getAttribute('d'))"
-    drawn = browser.run(paths)
-    assert len(drawn) == 3
-    for control, label in (("axis", "return lost"), ("metric", "matched AUC")):
-        browser.run(
-            "document.querySelectorAll(`[name='power-${arguments[0]}']`)[1].click()", control
-        )
-        name = browser.run("return document.querySelector('#power svg').ariaLabel")
-        assert label in name.replace("Matched", "matched")
-        assert browser.run(paths) != drawn
-        focus = browser.run("return document.activeElement.name")
-        assert focus == f"power-{control}"
-    browser.run("document.querySelector('[name=power-row][value=rf]').click()")
-    assert browser.texts("#power .legend li") == ["riqn", "trivial rows"]
-    assert browser.run("return document.activeElement.value") == "rf"
-
-
-def test_of_many_power_curves_the_first_are_drawn_and_a_measure_may_be_missing(
-    window, entries, tmp_path
-):
-    rows = {f"row-{i}": (0, 1 - i / 20) for i in range(10)} | {"riqn": (0, 0.2), "clock": (0, 0)}
-    suites = helpers_site.graded(tmp_path, rows, [DETECTION])
-    window.open(written(entries, tmp_path, suites) + "#/power")
-    window.wait_for("document.querySelector('#power') !== null")
-    drawn = [*(f"row-{i}" for i in range(8)), "riqn", "trivial rows"]
-    assert window.texts("#power .legend li") == drawn
-    window.run("document.querySelectorAll('[name=power-metric]')[1].click()")
-    assert window.text("#power .note") == "The records of split mini do not have this measure."
-    assert window.texts("#power table caption")
-
-
-# -- overviews, pairs, the player -----------------------------------------------------------------
-
-
-def test_quality_and_cost_are_points_that_lead_to_their_rows(browser, url, entries):
-    open_view(browser, url, "cost")
-    labels = browser.texts("#costs tbody th a")
-    assert labels == ["riqn", "rf", "persistence", "clock"]
-    assert sorted(browser.texts(".spot text")) == sorted(labels)
-    browser.run("document.querySelector('.spot').focus()")
-    browser.press("enter")
-    browser.wait_for("document.querySelector('#cells') !== null")
-    assert browser.text("#detector h1").startswith("riqn")
-
-
-def test_labels_of_the_figure_of_costs_cover_nothing(window, tmp_path):
-    url = helpers_site.write_site(tmp_path, helpers_site.full(tmp_path, 24))
-    window.open("about:blank")
-    window.open(f"{url}#/cost")
-    window.wait_for("document.querySelector('.spot') !== null")
-    outcome = window.run(
-        """
-        const spots = [...document.querySelectorAll(".spot")];
-        const boxes = spots.flatMap((spot) => [...spot.querySelectorAll("circle, text")])
-          .map((node) => [node, node.getBBox()]);
-        const covered = [];
-        for (const [node, a] of boxes) for (const [other, b] of boxes) {
-          if (node === other || node.localName === "circle") continue;
-          const wide = Math.min(a.x + a.width, b.x + b.width) - Math.max(a.x, b.x);
-          const high = Math.min(a.y + a.height, b.y + b.height) - Math.max(a.y, b.y);
-          if (wide > 1 && high > 3) covered.push(node.textContent + " " + other.outerHTML);
-        }
-        return [spots.length, covered];
-        """
-    )
-    assert outcome == [24, []]
-
-
-@pytest.mark.parametrize(("columns", "number"), [("anomaly", 4), ("environment", 2), ("cell", 8)])
-def test_the_map_of_cells_has_the_boards_numbers(browser, url, entries, columns, number):
-    open_view(browser, url, "heat")
-    browser.run(
-        "document.querySelector(`[name=heat-columns][value=${arguments[0]}]`).click()", columns
-    )
-    section = sections(entries)[0]
-    board = section.ranks.board
-    wanted = {
-        "anomaly": [(board.environments, [a]) for a in board.anomalies],
-        "environment": [([e], board.anomalies) for e in board.environments],
-        "cell": [([e], [a]) for e in board.environments for a in board.anomalies],
-    }[columns]
-    assert len(wanted) == number
-    shown = iter(browser.texts("#heatmap tbody td"))
-    primary = [s.entry for s in section.ranks.standings if s.primary]
-    for row, (some, anomalies) in itertools.product(
-        primary, [*wanted, (board.environments, board.anomalies)]
-    ):
-        value = board.mean(row, some, anomalies, "auc_matched")
-        assert next(shown) == show_value(value, "auc_matched")
-
-
-def test_two_rows_side_by_side_have_their_test_and_differences(browser, url, entries):
-    section = sections(entries)[0]
-    open_view(browser, url, "compare")
-    assert browser.text("#detector h1") == "riqn and rf"
-    (test,) = [
-        c for c in section.ranks.ranking.comparisons if (c.first, c.second) == ("riqn", "rf")
-    ]
-    text = browser.text("#difference p").replace("\N{MINUS SIGN}", "-")
-    assert f"differs by {100 * test.difference:+.1f} points" in text
-    assert ("is significantly better" in text) == test.better
-    # A picture and five figures come before everything else.
-    first = "return document.querySelector('#detector :is(figure, tbody)').localName"
-    assert browser.run(first) == "figure"
-    assert len(browser.texts("#short tbody tr")) == 5
-    headings = browser.texts("#detector h2")
-    assert headings[0] == "Difference"
-    assert headings[-1] == "All metrics"
-    board = section.ranks.board
-    one, other = (s.entry for s in section.ranks.standings if str(s.entry) in ("riqn", "rf"))
-    values = [board.mean(row, ["hopper"], ["gravity"], "auc_matched").value for row in (one, other)]
-    gaps = [t.replace("\N{MINUS SIGN}", "-") for t in browser.texts("#cells .heat td a")]
-    assert float(gaps[6]) == pytest.approx(100 * (values[0] - values[1]), abs=0.051)
-    browser.choose("second", "clock")
-    browser.wait_for("document.querySelector('#detector h1').textContent === 'riqn and clock'")
-
-
-def test_the_player_shows_an_episode_up_to_a_time(browser, entries):
-    (unit,) = [u for u in read_curves(entries[0].curves)["units"]
-               if u["cell"].startswith("mini/cartpole/iid::riqn[h=1,")]  # fmt: skip
-    example = unit["example"]
-    open_row(browser, "riqn")
     at = example["start"] + 3
     browser.run(
         "const slider = document.querySelector('.player input'); slider.value = arguments[0];"
         "slider.dispatchEvent(new Event('input'))", at
     )  # fmt: skip
     assert browser.text(".player output").startswith(f"t = {at}, {example['onset'] - at} before")
-    shown = "return Number(document.querySelector('clipPath rect').getAttribute('width'))"
-    before = browser.run(shown)
-    browser.run("document.querySelector('.player button').click()")
+    browser.click(".player button")
     browser.wait_for(f"Number(document.querySelector('.player input').value) > {at}")
-    assert browser.run(shown) > before
-    assert browser.text(".player button") == "Pause"
     browser.click(".player button")
     assert browser.text(".player button") == "Play"
 
 
-def test_colours_follow_the_button_and_are_kept(browser, url):
-    before = browser.run(THEME)
-    browser.click("#theme")
-    try:
-        assert {before, browser.run(THEME)} == {"light", "dark"}
-        # What one page stores reaches the next one late, now and then: it is opened until it has.
-        until = time.monotonic() + 10
-        kept = before
-        while kept == before and time.monotonic() < until:
-            browser.open("about:blank")
-            browser.open(url)
-            kept = browser.run(THEME)
-        assert kept != before
-    finally:
-        browser.run("localStorage.removeItem('oodd-theme')")
+# -- overviews ------------------------------------------------------------------------------------
+
+
+def test_weaker_anomalies_are_drawn_over_strength_and_over_their_cost(browser):
+    browser.run("location.hash = '#/power'")
+    browser.wait_for("document.querySelector('#power') !== null")
+    assert sorted(browser.texts("#power .legend li")) == ["rf", "riqn", "trivial rows"]
+    paths = "return [...document.querySelectorAll('#power path')].map((p) => p.getAttribute('d'))"
+    drawn = browser.run(paths)
+    assert len(drawn) == 3
+    for control in ("axis", "metric"):
+        browser.run(
+            "document.querySelectorAll(`[name='power-${arguments[0]}']`)[1].click()", control
+        )
+        assert browser.run(paths) != drawn
+        assert browser.run("return document.activeElement.name") == f"power-{control}"
+    browser.run("document.querySelector('[name=power-row][value=rf]').click()")
+    assert browser.texts("#power .legend li") == ["riqn", "trivial rows"]
+
+
+def test_quality_and_cost_are_points_that_lead_to_their_rows(browser, url):
+    open_view(browser, url, "cost")
+    labels = browser.texts("#costs tbody th a")
+    assert labels == ["oracle", "riqn", "mine", "rf", "clock"]
+    assert sorted(browser.texts(".spot text")) == sorted(labels)
+    browser.run("document.querySelectorAll('.spot')[1].focus()")
+    browser.press("enter")
+    browser.wait_for("document.querySelector('#cells') !== null")
+    assert browser.text("#detector h1").startswith("riqn")
+
+
+@pytest.mark.parametrize("columns", ["anomaly", "environment", "cell"])
+def test_the_map_of_cells_has_the_boards_numbers(browser, url, season, columns):
+    open_view(browser, url, "heat")
+    browser.run(
+        "document.querySelector(`[name=heat-columns][value=${arguments[0]}]`).click()", columns
+    )
+    board = season.ranks.board
+    wanted = {
+        "anomaly": [(board.environments, [a]) for a in board.anomalies],
+        "environment": [([e], board.anomalies) for e in board.environments],
+        "cell": [([e], [a]) for e in board.environments for a in board.anomalies],
+    }[columns]
+    shown = iter(browser.texts("#heatmap tbody td"))
+    for standing, (some, anomalies) in itertools.product(
+        season.ranks.standings, [*wanted, (board.environments, board.anomalies)]
+    ):
+        value = board.mean(standing.entry, some, anomalies, "auc_matched")
+        assert next(shown) == show_value(value, "auc_matched")
 
 
 # -- all of it ------------------------------------------------------------------------------------
 
-
-VIEWS = [
-    "",
-    "?view=aucs",
-    "?view=guaranteed",
-    "?view=alarms",
-    "?view=environments",
-    "?view=anomalies",
-    "?view=cost",
-    "power",
-    "cost",
-    "heat",
-    "detector",
-    "compare",
-]
-
+VIEWS = ["", "?wide=true", "?environment=hopper", "?board=BOARD", "power", "cost", "heat",
+         "detector"]  # fmt: skip
 
 NAMELESS = """
     const named = (e) => e.getAttribute("aria-label") || e.textContent.trim();
@@ -718,35 +454,19 @@ NAMELESS = """
 """
 """A script: what has no name and is not among what axe takes for serious."""
 
-
-def open_view(browser, url, view):
-    """Open a page by its address, with the first rows where it is of rows."""
-    rows = browser.run(
-        "return [...document.querySelectorAll('[data-row]')].map(e => e.dataset.row)"
-    )
-    rows = [urllib.parse.quote(row, safe="") for row in rows]
-    address = {"detector": f"detector/{rows[0]}", "compare": f"compare/{rows[0]}/{rows[1]}"}
-    browser.open("about:blank")
-    browser.open(f"{url}#/{address.get(view, view)}")
-    shown = "[...document.querySelectorAll('main h1, #ranking')].some((e) => e.checkVisibility())"
-    browser.wait_for(f"!document.querySelector('[aria-busy], [role=status]') && {shown}")
+THEME = "return document.documentElement.dataset.theme"
 
 
 @pytest.mark.parametrize("theme", ["light", "dark"])
 @pytest.mark.parametrize("width", [390, 1280])
 def test_every_page_can_be_read_at_every_width_and_in_every_colour(browser, url, width, theme):
-    rows = {
-        row["id"]
-        for board in browser.run("return JSON.parse(document.getElementById('data').text).boards")
-        for row in board["rows"]
-    }
-    assert any("window=3" in row for row in rows)
-    cards = [f"detector/{urllib.parse.quote(row, safe='')}" for row in sorted(rows)]
+    boards = browser.run("return JSON.parse(document.getElementById('data').text).boards")
     defects = {}
     with browser.colours(theme), browser.narrow(width):
-        for view in (*VIEWS, *(cards if (theme, width) == ("dark", 390) else ())):
-            open_view(browser, url, view)
+        for view in VIEWS:
+            open_view(browser, url, view.replace("BOARD", boards[1]["id"]))
             assert browser.run(THEME) == theme
+            assert browser.texts("header nav a") == ["Home", "Board", "Submit", "Source"]
             if lines := browser.defects(width) + browser.run(NAMELESS):
                 defects[view] = lines
             browser.open(url)  # so that the next view finds the rows
@@ -767,7 +487,21 @@ def test_the_reader_of_defects_sees_them(window, tmp_path):
     assert kinds == {"scrolls sideways", "broken", "color-contrast", "html-has-lang"}
 
 
-THEME = "return document.documentElement.dataset.theme"
+def test_colours_follow_the_button_and_are_kept(browser, url):
+    before = browser.run(THEME)
+    browser.click("#theme")
+    try:
+        assert {before, browser.run(THEME)} == {"light", "dark"}
+        # What one page stores reaches the next one late, now and then: it is opened until it has.
+        until = time.monotonic() + 10
+        kept = before
+        while kept == before and time.monotonic() < until:
+            browser.open("about:blank")
+            browser.open(url)
+            kept = browser.run(THEME)
+        assert kept != before
+    finally:
+        browser.run("localStorage.removeItem('oodd-theme')")
 
 
 def test_the_policy_stops_requests(window, url):
@@ -788,46 +522,59 @@ def test_the_policy_stops_requests(window, url):
     assert any("Content Security Policy" in message for message in window.console())
 
 
+@pytest.mark.parametrize("width", [390, 1280])
+def test_reported_logs_have_columns_of_their_own_and_no_twins(window, tmp_path, width):
+    records = ResultsDirectory(ROOT / "leaderboard" / "suites" / "logs").records()
+    of_split = [r for r in records if r.split.startswith("skab")]
+    url = written(tmp_path, sections([Reported(tmp_path, of_split)]))
+    window.open(url)
+    with window.narrow(width):
+        for view in ("", "?wide=true", "heat", "detector"):
+            open_view(window, url, view)
+            assert [line for line in window.defects(width) if "scrolls" in line] == []
+            text = window.run("return document.querySelector('main').innerText").lower()
+            text = text.partition("all metrics\n")[0].replace("without twins", "")
+            assert "twin" not in text
+            assert "matched" not in text
+            window.open(url)
+    titles = column_titles(window)
+    assert titles[:2] == ["Detector", "Pooled AUC"]
+    assert titles[-3:] == FIVE[2:]
+    assert window.console() == []
+
+
 def test_a_page_without_entries_says_so(window, tmp_path):
-    window.open(written([], tmp_path))
+    window.open(written(tmp_path, []))
     assert "There are no entries yet." in window.texts("#overview .note")
     assert window.console() == []
 
 
-def test_a_board_on_which_everything_failed_is_shown(window, tmp_path):
+def test_a_table_on_which_everything_failed_is_shown(window, tmp_path):
     record = helpers_site.make_record(status="oom", reason="needed 9 GB")
-    helpers_site.write_entry(tmp_path / "results", "one", [record])
-    entries = read_entries(tmp_path / "results")
-    window.open(written(entries, tmp_path))
+    window.open(written(tmp_path, sections([helpers_site.report(tmp_path, "one", [record])])))
     assert column(window, "Matched AUC") == {"riqn": "oom"}
     open_row(window, "riqn")
     assert window.text(".failure") == "oom: needed 9 GB"
     assert window.console() == []
 
 
-def test_a_lost_data_file_is_named(window, entries, tmp_path):
-    url = written(entries, tmp_path)
+def test_a_lost_data_file_is_named(window, season, tmp_path):
+    url = written(tmp_path, (), (), [season])
     for file in (tmp_path / site.PARTS).glob("*.js"):
         file.unlink()
     window.open(url)
     assert "riqn" in window.texts(LABELS)
-    window.run("document.querySelector('[name=view][value=environments]').click()")
+    window.run("document.querySelector('[name=environment]').value = 'hopper'")
+    window.run("document.querySelector('[name=environment]').dispatchEvent(new Event('change'))")
     window.wait_for("document.querySelector('.failure') !== null")
     assert "oodd-eval leaderboard build" in window.text("[role=alert]")
     window.console()
 
 
-# -- a board as large as it gets ------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def large(tmp_path_factory):
-    """Address of the page of 500 detectors."""
-    home = tmp_path_factory.mktemp("site")
-    return helpers_site.write_site(home, helpers_site.full(home, 500))
-
-
-def test_the_first_view_of_500_rows_takes_less_than_a_second(window, large):
+def test_the_first_view_of_500_rows_takes_less_than_a_second(window, tmp_path):
+    files = helpers_site.full(500)
+    assert len(files[site.PAGE]) < 1_000_000
+    large = helpers_site.write_site(tmp_path, files)
     walls, processors = [], []
     paint = "performance.getEntriesByName('first-contentful-paint')[0]"
     load = "performance.getEntriesByType('navigation')[0]"

@@ -10,13 +10,16 @@ import base64
 import hashlib
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from html import escape
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final
 
-from oodd_eval._version import __version__
-from oodd_leaderboard.reported import REPORTED, LeaderboardSection, SuiteSection
-from oodd_leaderboard.site.content import Json, site_data
+from oodd_eval._version import __version__, repository
+from oodd_leaderboard.reported import LeaderboardSection, SuiteSection
+from oodd_leaderboard.seasons import SeasonBoard
+from oodd_leaderboard.site.content import Json, season_line, site_data
 
 PAGE: Final = "index.html"
 PARTS: Final = "data"  # directory of the data files
@@ -24,46 +27,70 @@ PARTS: Final = "data"  # directory of the data files
 SCRIPTS: Final = (
     "core.js",
     "model.js",
-    "columns.js",
     "table.js",
-    "filters.js",
     "plots.js",
     "player.js",
     "power.js",
     "overviews.js",
     "detector.js",
-    "pair.js",
     "main.js",
 )
 """Parts of the page's one script, in order."""
 
+LINKS: Final = {
+    "home": ("Home", "README.md"),
+    "submit": ("Submit", "docs/submitting.md"),
+    "source": ("Source", "."),
+}
+"""Titles of the links that every page has beside the board, and where they lead in a checkout."""
+
 _STATIC = Path(__file__).with_name("static")
+
+
+def links(leaderboard: Path) -> dict[str, str]:
+    """Return where the links of a site lead, by name: the repository, or the checkout it is in.
+
+    A site in neither has none. `leaderboard` is the directory that the site's is in.
+    """
+    if project := repository():
+        return {
+            name: project if name != "submit" else f"{project}/blob/main/{path}"
+            for name, (_, path) in LINKS.items()
+        }
+    here = leaderboard.absolute()
+    checkouts = (p for p in here.parents if (p / LINKS["submit"][1]).is_file())
+    if not (checkout := next(checkouts, None)):
+        return {}
+    up = "../" * (len(here.relative_to(checkout).parts) + 1)
+    return {name: up + path for name, (_, path) in LINKS.items()}
 
 
 def files(
     sections: Sequence[LeaderboardSection],
     suites: Sequence[SuiteSection] = (),
+    seasons: Sequence[SeasonBoard] = (),
     *,
-    project: str = "",
+    links: Mapping[str, str] = MappingProxyType({}),
 ) -> dict[str, str]:
-    """Return the files of a leaderboard's site by name; the same entries give the same bytes.
+    """Return the files of a leaderboard's site by name; the same input gives the same bytes.
 
-    `project` is the address of code and documents; without it the page does not link to them.
+    `links` are addresses by the names of `LINKS`; the page leaves out those that are not there.
     """
-    data, parts = site_data(sections, suites)
-    contents = {PAGE: index(data | {"project": project})}
+    data, parts = site_data(sections, suites, seasons)
+    contents = {PAGE: index(data, season_line(seasons), links)}
     for name, part in parts.items():
         contents[f"{PARTS}/{name}.js"] = data_file(name, part)
     return contents
 
 
-def index(data: Json) -> str:
+def index(data: Json, season: str = "", links: Mapping[str, str] = MappingProxyType({})) -> str:
     """Return the page with its index of all rows."""
     script = "(() => {\n" + "\n".join(_static(name) for name in SCRIPTS) + "})();\n"
     style = _static("style.css")
     parts = {
         "version": __version__,
-        "reported": REPORTED,
+        "season": escape(season),
+        "links": "\n".join(_anchors(links)),
         "style": style,
         "style-hash": _digest(style),
         "script": script,
@@ -72,6 +99,13 @@ def index(data: Json) -> str:
     }
     # One pass, so that nothing in the data is taken for a place to fill in.
     return re.sub(r"@([a-z-]+)@", lambda match: parts[match[1]], _static("page.html"))
+
+
+def _anchors(addresses: Mapping[str, str]) -> list[str]:
+    """Return the links that every page has: home, the board, how to submit, the source."""
+    anchors = {name: (title, addresses.get(name, "")) for name, (title, _) in LINKS.items()}
+    ordered = [anchors["home"], ("Board", "#/"), anchors["submit"], anchors["source"]]
+    return [f'<a href="{escape(to)}">{title}</a>' for title, to in ordered if to]
 
 
 def data_file(name: str, value: Any) -> str:

@@ -10,27 +10,35 @@ import hashlib
 import math
 import re
 import statistics
+from calendar import month_name
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import date
 from itertools import product
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, TABLE1, Quantity, paper_tables
+from oodd_eval.data.facts import ANOMALIES, GROUPS, Quantity, paper_tables, title_of
 from oodd_eval.data.parts import EnvironmentData
 from oodd_eval.data.split import SHIPPED, Split
 from oodd_eval.metrics.bootstrap import nan_mean
 from oodd_eval.metrics.catalogue import HEADLINE, METRICS, NAMES, RANKING, metric_info
 from oodd_eval.metrics.cusum import DRIFT, THRESHOLD
+from oodd_eval.metrics.ranking import Difference
 from oodd_eval.results.board import Board, grouped
+from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import NAN, Record
 from oodd_eval.results.report import findings_of
-from oodd_eval.results.standings import Standing
 from oodd_eval.results.strengths import COSTS, DETECTION, Strengths, curve
 from oodd_eval.results.tables import PAPERS, POOLED, missing_level
 from oodd_leaderboard.curve_file import read_curves
-from oodd_leaderboard.reported import LeaderboardSection, SubmittedEntry, SuiteSection, commands_of
+from oodd_leaderboard.entry import Entry
+from oodd_leaderboard.reported import REPORTED, LeaderboardSection, Reported, SuiteSection
+from oodd_leaderboard.seasons import SeasonBoard
+from oodd_leaderboard.standings import OrderedBoard, Standing
 
 _COMPARED: Final = (
     *("false_episodes", "early", "delay", "delay_censored", "missed"),
@@ -40,12 +48,14 @@ WITH_INTERVALS: Final = (
     *("auc_matched", "auc_smoothed", "auc_unpaired", "auc", *PAPERS),
     *(f"{name}_{HEADLINE}" for name in _COMPARED),
 )
-"""Metrics that have intervals on the site: those that comparisons are made with."""
+"""Metrics that have intervals on the site."""
 
-SUMMARIES: Final = ("all|all", "all|sensor", "all|dynamics")
+ALL: Final = "*"  # all environments or anomalies; a group of anomalies is `*sensor`
+
+SUMMARIES: Final = tuple(f"{ALL}|{ALL}{group}" for group in ("", *GROUPS))
 """Selections of cells whose means stand in the index; other means are made from a part."""
 
-ENTRY_FIELDS: Final = ("id", "title", "submitter", "created", "citation", "url", "caption")
+ENTRY_FIELDS: Final = ("authors", "paper", "year", "url", "licence", "sha256")
 """Fields of an entry that the site shows."""
 
 _OF_LOGS: Final = (*POOLED, "auc_outcome")
@@ -60,38 +70,100 @@ LEVELS: Final = 250  # least steps from zero to the largest value of a drawing: 
 HEAVY: Final = 30  # A largest value this many times the typical one asks for a logarithmic scale
 
 Json = dict[str, Any]
-Units = Mapping[str, list[Json]]  # curves of single cells by the id of their entry
+Units = Mapping[str, list[Json]]  # curves of single cells by the name of what is reported
 
 SelectedCell = tuple[str, str]  # environment and anomaly
 
 
+@dataclass(frozen=True, slots=True)
+class _Shown:
+    """A season's board or a table of reported rows: what stands at its head, and its rows."""
+
+    id: str
+    name: str
+    title: str
+    date: str
+    notice: str
+    season: Json | None
+    ranks: OrderedBoard
+    entries: Mapping[str, Entry]
+    sources: Mapping[Setting, Reported]
+
+
+def newest_first(seasons: Sequence[SeasonBoard]) -> list[SeasonBoard]:
+    """Return seasons by date, the newest first, and behind them trials."""
+    by_date = sorted(seasons, key=lambda s: (s.season.date, s.season.name), reverse=True)
+    return sorted(by_date, key=lambda s: s.season.trial)
+
+
+def season_line(seasons: Sequence[SeasonBoard]) -> str:
+    """Return the sentence at the head of every page: the newest season, or that there is none."""
+    boards = [s.season for s in newest_first(seasons) if not s.season.trial]
+    if boards:
+        return f"Season {boards[0].name}, {_day(boards[0].date)}."
+    if seasons:
+        return "A trial season: no board."
+    return "No season has been run yet: there is no board, and all rows are reported."
+
+
 def site_data(
-    sections: Sequence[LeaderboardSection], suites: Sequence[SuiteSection] = ()
+    sections: Sequence[LeaderboardSection],
+    suites: Sequence[SuiteSection] = (),
+    seasons: Sequence[SeasonBoard] = (),
 ) -> tuple[Json, dict[str, Json]]:
     """Return the index, and the parts by name.
 
     A row of the index names its part. A board names those of its metrics.
     """
-    entries = {entry.meta.id: entry for section in sections for entry in section.entries}
-    units = {i: read_curves(e.curves)["units"] for i, e in entries.items() if e.curves}
+    sources = {source.name: source for section in sections for source in section.sources.values()}
+    units = {name: read_curves(s.curves)["units"] for name, s in sources.items() if s.curves}
     parts: dict[str, Json] = {}
-    on_site = [_board(section, units, parts) for section in sections]
-    names = dict.fromkeys(
-        name for board in on_site for name in (*board["metrics"], board["ranking"])
-    )
-    used = {*TABLE1, *(name for board in on_site for name in board["anomalies"] if board["paired"])}
-    kinds = [a for a in ANOMALIES.values() if a.id in used]
+    shown = [*map(_of_season, newest_first(seasons)), *_of_reported(sections)]
+    boards = [_board(table, units, parts) for table in shown]
+    names = dict.fromkeys(name for b in boards for name in (*b["metrics"], b["ranking"]))
     data = {
         "threshold": THRESHOLD,
         "drift": DRIFT,
         "metrics": {name: _metric(name) for name in names},
-        "environments": {e.id: _fields(e, "title", "family") for e in ENVIRONMENTS.values()},
-        "anomalies": {a.id: _fields(a, "title", "group", "summary") for a in kinds},
         "paper": paper_tables()["table5_groups_delta1"],
-        "boards": on_site,
-        "power": [_power(suite) for suite in suites if suite.graded],
+        "boards": boards,
+        "suites": [_suite(s) for s in sorted(suites, key=lambda suite: not suite.graded)],
     }
     return data, parts
+
+
+def _day(iso: str) -> str:
+    """Return a day in words; empty as it is."""
+    if not iso:
+        return ""
+    day = date.fromisoformat(iso)
+    return f"{day.day} {month_name[day.month]} {day.year}"
+
+
+def _of_season(board: SeasonBoard) -> _Shown:
+    season = board.season
+    name = f"{'Trial' if season.trial else 'Season'} {season.name}"
+    lacking = f": no board, since it lacks {', '.join(board.lacks)}" if season.trial else ""
+    about = _fields(season, "bits", "seeds", "oodd_eval") | {
+        "installed": {
+            entry: [_fields(wheel, "distribution", "version", "sha256") for wheel in wheels]
+            for entry, wheels in season.installed.items()
+        }
+    }
+    texts = (board.name, name, f"{name}{lacking}", _day(season.date), "")
+    return _Shown(*texts, about, board.ranks, season.entries, {})
+
+
+def _of_reported(sections: Sequence[LeaderboardSection]) -> list[_Shown]:
+    splits = Counter(section.ranks.board.split for section in sections)
+    shown = []
+    for section in sections:
+        board = section.ranks.board
+        apart = f" ({board.digest[:8]})" if splits[board.split] > 1 else ""
+        name = f"Reported: {board.split}{apart}"
+        texts = (section.name, name, name, _day(section.date), REPORTED)
+        shown.append(_Shown(*texts, None, section.ranks, section.entries, section.sources))
+    return shown
 
 
 def part_name(text: str) -> str:
@@ -100,16 +172,17 @@ def part_name(text: str) -> str:
     return f"{slug}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
 
 
-def _power(section: SuiteSection) -> Json:
-    """Return tables of a board of graded strengths, and each row's means along the ladder."""
+def _suite(section: SuiteSection) -> Json:
+    """Return tables of a further test suite, and of graded strengths each row's means by rung."""
     # Points are (strength, share of the return lost, value), the weakest strength first.
     board, tables = section.board, section.tables[:2]
     rows = {str(row): row for row in board.entries}
-    records = grouped(board.records, lambda r: str(r.setting))
+    records = grouped(board.records, lambda r: str(r.setting)) if section.graded else {}
     metrics = DETECTION, RANKING
     return {
+        "name": section.name,
         **_fields(board, "split", "digest"),
-        "unit": COSTS.get(Strengths.of(board.records).base, ""),
+        "unit": COSTS.get(Strengths.of(board.records).base, "") if section.graded else "",
         "tables": [_fields(table, "title", "header", "rows", "note") for table in tables],
         "metrics": [_metric(name) | {"chance": name == RANKING} for name in metrics],
         "rows": [
@@ -121,7 +194,7 @@ def _power(section: SuiteSection) -> Json:
                     for name in metrics
                 ],
             }
-            for label, *_ in (tables[0].rows if tables else ())
+            for label, *_ in (tables[0].rows if section.graded and tables else ())
         ],
     }
 
@@ -136,137 +209,152 @@ def _metric(name: str) -> Json:
     return {"title": title, "meaning": info.summary, "kind": info.unit, "better": info.better}
 
 
-def _board(section: LeaderboardSection, units: Units, parts: dict[str, Json]) -> Json:
-    ranks, board = section.ranks, section.ranks.board
+def _board(shown: _Shown, units: Units, parts: dict[str, Json]) -> Json:
+    board = shown.ranks.board
     present = {name for r in board.records for name in r.metrics}
     # Where every cell has failed, the page still shows the metrics without a level.
     usual = [name for name, info in METRICS.items() if info.cells != "unpaired"]
     names = [name for name in NAMES if name in present] or (usual if board.paired else [])
     have = {(r.environment, r.anomaly) for r in board.records}
     cells = [c for c in product(board.environments, board.anomalies) if c in have]
-    names_of_logs = None if board.paired else _names_of_logs(board)
-    filtered = selections(cells, names_of_logs)
-    rows, ends, by_cell = [], {}, {}
-    for standing in ranks.standings:
-        row, part = _row(section, standing, names, filtered, units)
+    filtered = selections(cells, {a: g for g, kinds in board.groups.items() for a in kinds})
+    rows: list[Json] = []
+    for standing in shown.ranks.standings:
+        row, part = _row(shown, standing, len(rows), names, filtered, units)
         rows.append(row)
         parts[row["part"]] = part
-        ends[row["part"]] = _ranking_intervals(part, board, names)
-        by_cell[row["part"]] = _by_cell(standing, cells)
-    metric_parts = {name: part_name(f"{section.name}/{name}") for name in names}
-    for metric, name in metric_parts.items():
-        values = {
-            part: [_mean(records, metric) for records in of_row] for part, of_row in by_cell.items()
+    with_ends = _with_intervals(names, board)
+    metric_parts = {name: part_name(f"{shown.id}/{name}") for name in names}
+    of_rows = {row["part"]: parts[row["part"]] for row in rows}
+    for i, (metric, name) in enumerate(metric_parts.items()):
+        place = with_ends.index(metric) if metric in with_ends else None
+        parts[name] = {
+            "values": {part: content["values"][i] for part, content in of_rows.items()},
+            "intervals": {
+                part: {key: ends[place] for key, ends in content["intervals"].items()}
+                for part, content in of_rows.items()
+                if place is not None
+            },
         }
-        parts[name] = {"values": values, "intervals": ends if metric == board.ranking else {}}
+    strengths: dict[str, set[str]] = {}
+    for r in board.records:
+        strengths.setdefault(f"{r.environment}|{r.anomaly}", set()).add(r.strength)
     return {
-        "id": section.name,
-        "episodes": _episodes(section, parts, rows),
+        **_fields(shown, "id", "name", "title", "date", "notice", "season"),
+        "ranked": shown.season is not None,
+        "episodes": _episodes(shown.id, board, parts, rows),
         "cells": cells,
+        "strengths": {cell: "".join(s) for cell, s in strengths.items() if len(s) == 1},
         "parts": metric_parts,
-        **_fields(board, "split", "digest", "protocol", "limit"),
+        **_fields(board, "split", "digest", "protocol", "limit", "paired", "ranking", "level"),
         "tests": board.test_seeds(),
-        **_fields(board, "environments", "anomalies"),
-        **_fields(board, "paired", "ranking", "level"),
-        "own": names_of_logs,
+        "environments": {e: title_of(e) if board.paired else e for e in board.environments},
+        "anomalies": {a: _anomaly(board, a) for a in board.anomalies},
         "about": [] if board.paired else [*findings_of(board), *missing_level(board, HEADLINE)],
         "metrics": names,
-        "intervals": _with_intervals(names, board),
+        "intervals": with_ends,
         "rows": rows,
-        "resamples": ranks.ranking.resamples,
     }
 
 
-def _names_of_logs(board: Board) -> Json:
-    """Return environments and anomalies of logs, whose names may be the benchmark's for others."""
-    groups = {kind: group for group in GROUPS for kind in board.in_group(group)}
-    return {
-        "environments": {e: {"title": e, "family": ""} for e in board.environments},
-        "anomalies": {
-            a: {"title": a, "group": groups.get(a, ""), "summary": ""} for a in board.anomalies
-        },
-    }
+def _anomaly(board: Board, name: str) -> Json:
+    """Return an anomaly's title, group and summary; logs may use a benchmark's name for another."""
+    group = next((group for group, kinds in board.groups.items() if name in kinds), "")
+    if board.paired and name in ANOMALIES:
+        return _fields(ANOMALIES[name], "title", "summary") | {"group": group}
+    return {"title": name, "summary": "", "group": group}
 
 
 def _episodes(
-    section: LeaderboardSection, parts: dict[str, Json], rows: Sequence[Json]
+    identity: str, board: Board, parts: dict[str, Json], rows: Sequence[Json]
 ) -> dict[str, str]:
     """Add a part for each environment with the sensors of the episodes that rows show."""
-    if not (split := shipped_split(section.ranks.board.digest)):
+    if not (split := shipped_split(board.digest)):
         return {}
     episodes: dict[str, list[tuple[str, int]]] = {}
     for curves in (parts[row["part"]]["curves"] for row in rows):
         for cell, drawn in curves.items():
             environment, anomaly = cell.split("/")
             episodes.setdefault(environment, []).append((anomaly, drawn["example"]["index"]))
-    names = {environment: part_name(f"{section.name}/{environment}") for environment in episodes}
+    names = {environment: part_name(f"{identity}/{environment}") for environment in episodes}
     for environment, name in names.items():
         parts[name] = shown_episodes(split, environment, episodes[environment])
     return names
 
 
 def _row(
-    section: LeaderboardSection,
+    shown: _Shown,
     standing: Standing,
+    place: int,
     names: Sequence[str],
     filtered: Mapping[str, Sequence[SelectedCell]],
     units: Units,
 ) -> tuple[Json, Json]:
     """Return a row's line of the index, and its part."""
-    row, records = standing.entry, standing.records
-    source, label, ranks = section.sources[row], str(row), section.ranks
-    order = {cell: i for i, cell in enumerate(filtered["all|all"])}
-    in_order = sorted(records, key=lambda r: (order[r.environment, r.anomaly], r.seed))
-    intervals = _intervals(ranks.board, standing, names, filtered)
-    identity = f"{section.name}/{label}"
-    have = {(r.environment, r.anomaly) for r in records}
+    row, records, board = standing.entry, standing.records, shown.ranks.board
+    source = shown.sources.get(row)
+    entry = shown.entries.get(row.detector) or Entry(row.detector)
+    cells = filtered[f"{ALL}|{ALL}"]
+    intervals = _intervals(board, standing, names, filtered)
+    identity = f"{shown.id}/{row}"
+    by_cell = _by_cell(standing, cells)
     line = {
         "id": identity,
         "part": part_name(identity),
-        "label": label,
+        "label": str(row),
         "detector": row.detector,
         "plugin": records[0].plugin,
         "horizon": row.horizon,
         "overrides": row.overrides,
         "seeds": sorted({r.seed for r in records}),
-        **_fields(standing, "trivial", "primary", "inputs", "rank", "alarm_rank", "ties", "state"),
-        "training": standing.training,
-        "wins": _short(standing.wins),
-        "lead": standing.lead,
+        "place": place,
+        **_fields(standing, "rank", "equal", "band", "state", "variant", "trivial", "inputs"),
+        **_fields(standing, "training", "origin", "authors", "paper", "year"),
+        "url": entry.url,
+        "above": _difference(shown.ranks.above.get(row)),
+        "first": _difference(shown.ranks.first.get(row)),
+        "worst": _worst(board, row),
+        "seed_means": [_short(standing.seed_low), _short(standing.seed_high)],
         "cost": {n: _short(v) for n, v in standing.cost._asdict().items()},
-        **_fields(source.meta, "submitter", "caption"),
-        "missing": [i for i, cell in enumerate(filtered.get("all|all", [])) if cell not in have],
+        "missing": [i for i, of_cell in enumerate(by_cell) if not of_cell],
         "failed": [
-            [filtered["all|all"].index((r.environment, r.anomaly)), r.status, r.reason]
-            for r in in_order
-            if not r.ok
+            [i, r.status, r.reason] for i, cell in enumerate(by_cell) for r in cell if not r.ok
         ],
-        "means": _summaries(section, standing, names, filtered, intervals),
+        "means": _summaries(board, standing, names, filtered, intervals),
     }
-    compared = [c for c in ranks.ranking.comparisons if label in (c.first, c.second)]
+    whole = [of_cell if all(r.ok for r in of_cell) else [] for of_cell in by_cell]
     part = {
         "version": records[0].detector_version,
         "parameters": records[0].parameters,
-        "command": " && ".join(commands_of(records)),
-        "entry": _entry(source, records[0].plugin),
-        "cells": [_cell(r, names, _with_intervals(names, ranks.board)) for r in in_order],
+        "entry": _fields(entry, *ENTRY_FIELDS)
+        | {"requirement": entry.wheel or entry.requirement, "reported": source and source.name},
+        "values": [[_mean(of_cell, name) for of_cell in whole] for name in names],
         "intervals": intervals,
-        "comparisons": [
-            [c.second, *map(_short, (c.difference, c.low, c.high, c.p_holm))]
-            for c in compared
-            if c.first == label
-        ],
-        "worse_than": [c.first for c in compared if c.second == label and c.better],
-        "wins": {
-            other: _short(rate) for (first, other), rate in ranks.rates.items() if first == label
-        },
-        "curves": _curves(units.get(source.meta.id, []), records),
+        "curves": _curves(units.get(source.name, []) if source else [], records),
     }
     return line, part
 
 
+def _difference(test: Difference | None) -> Json | None:
+    """Return how far a row is below another one, with its interval and verdict."""
+    if test is None:
+        return None
+    numbers = {name: _short(getattr(test, name)) for name in ("difference", "low", "high", "p")}
+    return {"row": test.first, "told": test.told, **numbers}
+
+
+def _worst(board: Board, row: Setting) -> Json | None:
+    """Return the environment with the least mean of the metric that ranks, and that mean."""
+    every = board.anomalies
+    means = {e: board.mean(row, [e], every, board.ranking).value for e in board.environments}
+    if not (defined := [e for e in means if not math.isnan(means[e])]):
+        return None
+    worst = min(defined, key=means.__getitem__)
+    return {"value": _short(means[worst]), "environment": worst}
+
+
 def _summaries(
-    section: LeaderboardSection,
+    board: Board,
     standing: Standing,
     names: Sequence[str],
     filtered: Mapping[str, Sequence[SelectedCell]],
@@ -274,7 +362,7 @@ def _summaries(
 ) -> dict[str, list[list[int | None]]]:
     """Return means over the selections of the index: values, then low and high ends."""
     # They are whole numbers of the last digit that is printed, None where there is none.
-    board, summaries = section.ranks.board, {}
+    summaries = {}
     for key in (key for key in SUMMARIES if key in filtered):
         means = [board.mean(standing.entry, *_sides(filtered[key]), name) for name in names]
         values = [_digits(m.value, name) for m, name in zip(means, names, strict=True)]
@@ -287,59 +375,19 @@ def _summaries(
             ]
             for i in (0, 1)
         ]
-        summaries[key.partition("|")[2]] = [values, *ends]
+        summaries[key] = [values, *ends]
     return summaries
 
 
 def _by_cell(standing: Standing, cells: Sequence[SelectedCell]) -> list[list[Record]]:
-    """Return a row's records of every cell, none where one has failed."""
+    """Return a row's records of every cell."""
     by_cell = grouped(standing.records, lambda r: (r.environment, r.anomaly))
-    cells_of = [by_cell.get(cell, []) for cell in cells]
-    return [records if all(r.ok for r in records) else [] for records in cells_of]
+    return [by_cell.get(cell, []) for cell in cells]
 
 
 def _mean(records: Sequence[Record], metric: str) -> float | None:
     """Return the mean over detector seeds; None where there is none."""
     return _short(nan_mean(r.metrics[metric].value for r in records if metric in r.metrics))
-
-
-def _ranking_intervals(
-    part: Json, board: Board, names: Sequence[str]
-) -> dict[str, list[float | None]]:
-    """Return a row's intervals of the metric that ranks by selection."""
-    # A cell of one record has its pair.
-    with_ends = _with_intervals(names, board)
-    if board.ranking not in with_ends:
-        return {}
-    index = with_ends.index(board.ranking)
-    intervals = {key: ends[index] for key, ends in part["intervals"].items()}
-    once = grouped(part["cells"], lambda cell: (cell["environment"], cell["anomaly"]))
-    for (environment, anomaly), cells in once.items():
-        if len(cells) == 1 and "values" in cells[0]:
-            pair = [cells[0][end][index] for end in ("low", "high")]
-            intervals[f"{environment}|{anomaly}"] = pair
-    return {key: pair for key, pair in intervals.items() if pair and None not in pair}
-
-
-def _entry(entry: SubmittedEntry, plugin: str) -> Json:
-    """Return who an entry is from, and the digest of the plug-in's source that it names."""
-    of_entry = entry.meta.plugins[::-1]
-    digests = {f"{p['distribution']}:{p['plugin']}": p["source_digest"] for p in of_entry}
-    return _fields(entry.meta, *ENTRY_FIELDS) | {"source_digest": digests.get(plugin, "")}
-
-
-def _cell(record: Record, names: Sequence[str], with_ends: Sequence[str]) -> Json:
-    """One record: its values, and its intervals, in the orders of the board's lists of names."""
-    plain = _fields(record, "environment", "anomaly", "seed")
-    if not record.ok:
-        return plain | _fields(record, "status", "reason")
-    metrics = [record.metrics.get(name) for name in names]
-    bounds = [(record.metrics.get(name), metric_info(name).unit) for name in with_ends]
-    return plain | {
-        "values": [m and _short(m.value) for m in metrics],
-        "low": [m and _printed(m.low, kind) for m, kind in bounds],
-        "high": [m and _printed(m.high, kind) for m, kind in bounds],
-    }
 
 
 def _intervals(
@@ -349,16 +397,23 @@ def _intervals(
     filtered: Mapping[str, Sequence[SelectedCell]],
 ) -> Json:
     """Intervals of means by key of the selection, in the order of the board's ``intervals``."""
-    # A single record has its own.
+    # A single record has its own. The metric that ranks and false episodes have all of them.
     metrics = _with_intervals(names, board)
+    always = (board.ranking, f"false_episodes_{board.level}")
+    once = grouped(standing.records, lambda r: (r.environment, r.anomaly))
     intervals: dict[str, list[list[float | None] | None]] = {}
     for (i, metric), (key, cells) in product(enumerate(metrics), filtered.items()):
-        selected = metric == board.ranking or key in SUMMARIES
-        if not selected or len(cells) == standing.seeds == 1:
+        held = once.get(cells[0], []) if len(cells) == 1 else []
+        if len(held) == 1:
+            found = held[0].metrics.get(metric)
+            low, high = (found.low, found.high) if found else (NAN, NAN)
+        elif metric in always or key in SUMMARIES:
+            mean = board.mean(standing.entry, *_sides(cells), metric, intervals=True)
+            low, high = mean.low, mean.high
+        else:
             continue
-        mean = board.mean(standing.entry, *_sides(cells), metric, intervals=True)
-        if not math.isnan(mean.low):
-            bounds = [_printed(v, metric_info(metric).unit) for v in (mean.low, mean.high)]
+        if not math.isnan(low):
+            bounds = [_printed(v, metric_info(metric).unit) for v in (low, high)]
             intervals.setdefault(key, [None] * len(metrics))[i] = bounds
     return intervals
 
@@ -444,33 +499,20 @@ def _sides(cells: Sequence[SelectedCell]) -> tuple[list[str], list[str]]:
 
 
 def selections(
-    cells: Sequence[SelectedCell], logs: Json | None = None
+    cells: Sequence[SelectedCell], groups: Mapping[str, str]
 ) -> dict[str, list[SelectedCell]]:
     """Return the selections of cells that filters can make, by key.
 
-    A key is ``environments|anomalies``: for the one ``all``, a family or an environment, for the
-    other ``all``, a group or an anomaly. `logs` has what logs say of theirs; they have no families.
+    A key is ``environment|anomaly``, each of which may be all of them, ``*``; a group of anomalies
+    is ``*group``. `groups` has those of anomalies.
     """
-
-    def family(environment: str) -> str:
-        return environment if logs else ENVIRONMENTS[environment].family
-
-    def group(anomaly: str) -> str:
-        return logs["anomalies"][anomaly]["group"] or anomaly if logs else ANOMALIES[anomaly].group
-
-    environments: dict[str, set[str]] = {}
-    anomalies: dict[str, set[str]] = {}
+    selected: dict[str, list[SelectedCell]] = {}
     for environment, anomaly in cells:
-        for name in ("all", family(environment), environment):
-            environments.setdefault(name, set()).add(environment)
-        for name in ("all", group(anomaly), anomaly):
-            anomalies.setdefault(name, set()).add(anomaly)
-    selected = {
-        f"{some}|{label}": [(e, a) for e, a in cells if e in environments[some] and a in named]
-        for some in environments
-        for label, named in anomalies.items()
-    }
-    return {key: selection for key, selection in selected.items() if selection}
+        group = groups.get(anomaly, "")
+        kinds = (ALL, *([ALL + group] if group else []), anomaly)
+        for key in product((ALL, environment), kinds):
+            selected.setdefault("|".join(key), []).append((environment, anomaly))
+    return selected
 
 
 def shipped_split(digest: str) -> Split | None:

@@ -1,16 +1,12 @@
-// Which view an address asks for: `#/[?FILTERS]` the table, `#/detector/ROW[/PLACE/ANOMALY]` a row,
-// `#/compare/ROW/ROW[/PLACE/ANOMALY]` two rows, `#/power`, `#/cost` and `#/heat` the overviews.
+// Which view an address asks for: `#/[?FILTERS]` the table, `#/detector/ROW[/ENVIRONMENT/ANOMALY]` a row,
+// `#/power`, `#/cost` and `#/heat` the overviews.
 
 const PAGES = {
   detector: {
     find: ([id]) => ROWS.get(id), parts: ({ row }) => [row.part], draw: ({ board, row }, [, ...cell]) => detectorPage(board, row, cell),
     again: ({ board, row }, [, ...cell]) => cellSections(board, row, cell), title: ({ row }) => row.label,
   },
-  compare: {
-    find: ([one, other]) => pairOf(one, other), parts: ({ rows }) => rows.map((row) => row.part),
-    draw: ({ board, rows }, [, , ...cell]) => pairPage(board, rows, cell), title: ({ rows }) => rows.map((row) => row.label).join(" and "),
-  },
-  power: { find: () => DATA.power.length ? {} : null, draw: () => powerPage(), title: () => "Weaker anomalies" },
+  power: { find: () => DATA.suites.length ? {} : null, draw: () => powerPage(), title: () => "Weaker anomalies, worlds, logs" },
   cost: { find: () => ({ board: currentBoard() }), draw: ({ board }) => costPage(board), title: () => "Quality and cost" },
   heat: {
     find: () => ({ board: currentBoard() }), parts: ({ board }) => known(board, [board.ranking]).map((metric) => board.parts[metric]),
@@ -35,7 +31,7 @@ async function route() {
   if (!found) {
     place.replaceChildren();
     restore(wanted.startsWith("?") ? wanted : "");
-    drawFilters();
+    drawControls();
     await drawTable();
     const link = shown && document.querySelector(`[data-row="${CSS.escape(shown)}"] a`);
     if (link) link.focus();
@@ -58,7 +54,7 @@ async function route() {
     // Another cell of the same row: what is below stays, which with hundreds of rows is long.
     for (const node of page.again(found, rest)) document.getElementById(node.id).replaceWith(node);
   } else place.replaceChildren(...[page.draw(found, rest)].flat().filter(Boolean));
-  const id = [view, ...rest.slice(0, view === "compare" ? 2 : 1)].join("/");
+  const id = [view, ...rest.slice(0, 1)].join("/");
   if (shown !== id && shown !== rest[0]) {
     window.scrollTo(0, 0);
     place.querySelector("h1").focus();
@@ -68,24 +64,10 @@ async function route() {
   shown = view === "detector" ? rest[0] : id;
 }
 
-const currentBoard = () => DATA.boards.find((b) => b.id === state.board) ?? DATA.boards[0];
-
-/** The two rows that an address names, where they are of one board. */
-function pairOf(one, other) {
-  const [first, second] = [ROWS.get(one), ROWS.get(other)];
-  if (!first) return null;
-  if (second?.board === first.board) return { board: first.board, rows: [first.row, second.row] };
-  const best = first.board.rows.find((row) => row !== first.row);
-  return best ? { board: first.board, rows: [first.row, best] } : null;
-}
-
-const ALARMS = "?view=guaranteed&sort=alarm_rank&ascending=true";
-
 /** Say in the navigation which page this is. */
 function markNavigation(view) {
-  for (const link of document.querySelectorAll("nav.site a[href^='#']")) {
-    const current = link.getAttribute("href") === `#/${view}`;
-    if (current) link.setAttribute("aria-current", "page");
+  for (const link of document.querySelectorAll("header.site nav a[href^='#']")) {
+    if (link.getAttribute("href") === `#/${view}`) link.setAttribute("aria-current", "page");
     else link.removeAttribute("aria-current");
   }
 }
@@ -126,13 +108,11 @@ document.getElementById("theme").addEventListener("click", () => {
   setTheme(isDark() ? "light" : "dark");
   route();
 });
-if (DATA.project) document.getElementById("project").replaceChildren(element("a", { href: DATA.project, rel: "noopener noreferrer external" }, "Code and documents"));
 if (DATA.boards.every((board) => board.paired)) for (const node of document.querySelectorAll(".of-logs")) node.remove();
-if (!DATA.power.length) document.querySelector("nav.site a[href='#/power']").hidden = true;
 if (DATA.boards.length) {
   window.addEventListener("hashchange", route);
   route();
 } else {
-  document.querySelector("nav.site").hidden = true;
-  document.getElementById("overview").append(element("p", { class: "note" }, "There are no entries yet."));
+  document.getElementById("more").hidden = true;
+  document.getElementById("head").append(element("h1", {}, "Leaderboard"), element("p", { class: "note" }, "There are no entries yet."));
 }

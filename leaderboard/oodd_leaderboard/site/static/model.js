@@ -2,7 +2,7 @@
 
 const DATA = JSON.parse(document.getElementById("data").textContent);
 const ROWS = new Map(DATA.boards.flatMap((board) => board.rows.map((row) => [row.id, { board, row }])));
-const EVERYTHING = { environment: "all", group: "all", anomaly: "all" };
+const EVERYTHING = { environment: "*", anomaly: "*" };
 
 const PARTS = new Map();
 const awaited = new Map();
@@ -30,39 +30,42 @@ function load(name) {
 const notLoaded = (error) => element("p", { class: "failure", role: "alert" },
   `Data of this page is missing: ${error.message}. Keep the directory "data" beside index.html, or build the site again with "oodd-eval leaderboard build".`);
 
-/** What is known of an environment or an anomaly: logs have names of their own. */
-const environmentOf = (board, name) => (board.own ?? DATA).environments[name];
-const anomalyOf = (board, name) => (board.own ?? DATA).anomalies[name];
+/** A board's name of an environment or anomaly; and of an anomaly its group and what it does. */
+const environmentOf = (board, name) => board.environments[name];
+const anomalyOf = (board, name) => board.anomalies[name];
 
-/** The title of a cell. */
-const cellTitle = (board, { environment, anomaly }) => `${environmentOf(board, environment).title}, ${anomalyOf(board, anomaly).title}`;
+/** The title of a cell, with the strength of its anomaly where it has several. */
+function cellTitle(board, { environment, anomaly }) {
+  const strength = board.strengths[`${environment}|${anomaly}`];
+  return `${environmentOf(board, environment)}, ${anomalyOf(board, anomaly).title}${strength ? ` (${strength})` : ""}`;
+}
 
 /** The title of the metric that a board ranks by, as it begins a sentence, or within one. */
 const rankingTitle = (board) => DATA.metrics[board.ranking].title;
 const rankingName = (board) => board.paired ? "matched AUC" : rankingTitle(board).replace(/^P/, "p");
 
 /** The level of a board's guaranteed alarms, such as 5 %. */
-const levelOf = (board) => `${board.level.replace(/\D/g, "")} %`;
+const levelOf = (board) => `${board.level.replace(/\D/g, "")}\u00a0%`;
 
-/** Whether a cell is among those selected. */
-function selects(board, selection, cell) {
-  const { environment, group, anomaly } = selection;
-  const { family } = environmentOf(board, cell.environment);
-  return (
-    (environment === "all" || environment === family || environment === cell.environment) &&
-    (group === "all" || group === anomalyOf(board, cell.anomaly).group) &&
-    (anomaly === "all" || anomaly === cell.anomaly)
-  );
+const GROUP_TITLES = { sensor: "Sensor", dynamics: "Dynamics" };
+
+/** Anomalies of a board that belong to a group; those of no group belong to "". */
+const inGroup = (board, group) => Object.keys(board.anomalies).filter((a) => anomalyOf(board, a).group === group);
+
+/** Whether a cell is among those selected. A selection is an environment and an anomaly; `*` is all, `*sensor` a group. */
+function selects(board, { environment, anomaly }, cell) {
+  return ["*", cell.environment].includes(environment) &&
+    ["*", `*${anomalyOf(board, cell.anomaly).group}`, cell.anomaly].includes(anomaly);
 }
 
 /** The name of a selection's mean where a part of the data has its interval. */
-const keyOf = ({ environment, group, anomaly }) => `${environment}|${anomaly !== "all" ? anomaly : group}`;
+const keyOf = ({ environment, anomaly }) => `${environment}|${anomaly}`;
 
 const places = new Map();
 
 /** Places of a selection's cells in the board's list, worked out once. */
 function cellsOf(board, selection) {
-  const key = [board.id, selection.environment, selection.group, selection.anomaly].join("|");
+  const key = `${board.id}|${keyOf(selection)}`;
   if (!places.has(key)) {
     places.set(key, board.cells.flatMap(([environment, anomaly], i) =>
       selects(board, selection, { environment, anomaly }) ? [i] : []));
@@ -70,8 +73,11 @@ function cellsOf(board, selection) {
   return places.get(key);
 }
 
+/** Anomalies of the selected cells. */
+const selectedAnomalies = (board, selection) => [...new Set(cellsOf(board, selection).map((i) => board.cells[i][1]))];
+
 /** Whether the index has means over a selection: over all environments and one group or both. */
-const isSummary = ({ environment, anomaly }) => environment === "all" && anomaly === "all";
+const isSummary = ({ environment, anomaly }) => environment === "*" && anomaly[0] === "*";
 
 /** The part that a board's metric is in. */
 const partOf = (board, metric) => PARTS.get(board.parts[metric]);
@@ -89,7 +95,7 @@ const wholeDigits = (kind) => kind === "steps" ? 10 : 1000;
  *
  * `state` is a failed cell's, and then there is no value; `partial` tells that other rows have
  * cells here that this one lacks. Over all environments and anomalies it is the index's; any other
- * selection is averaged from the metric's part, where it is loaded.
+ * selection is averaged from the part of the metric or of the row, whichever is loaded.
  */
 function mean(board, row, metric, selection = EVERYTHING) {
   const chosen = cellsOf(board, selection);
@@ -99,36 +105,25 @@ function mean(board, row, metric, selection = EVERYTHING) {
   if (!count) return found;
   const failed = row.failed.find(([place]) => chosen.includes(place));
   if (failed) return { ...found, state: failed[1], reason: failed[2] };
+  const [index, place, key] = [board.metrics.indexOf(metric), board.intervals.indexOf(metric), keyOf(selection)];
   if (isSummary(selection)) {
-    const [values, lows, highs] = row.means[selection.group] ?? [[], [], []];
+    const [values, lows, highs] = row.means[key] ?? [[], [], []];
     const unit = wholeDigits(DATA.metrics[metric].kind);
     const number = (whole) => isNumber(whole) ? whole / unit : null;
-    const place = board.intervals.indexOf(metric);
-    return { ...found, value: number(values[board.metrics.indexOf(metric)]), low: number(lows[place]), high: number(highs[place]) };
+    return { ...found, value: number(values[index]), low: number(lows[place]), high: number(highs[place]) };
   }
-  const part = partOf(board, metric);
-  if (!part) return found;
-  found.value = meanOf(chosen.map((i) => part.values[row.part][i]));
-  const key = chosen.length === 1 ? board.cells[chosen[0]].join("|") : keyOf(selection);
-  [found.low, found.high] = part.intervals[row.part]?.[key] ?? [null, null];
-  return found;
+  const [part, own] = [partOf(board, metric), PARTS.get(row.part)];
+  if (!part && !own) return found;
+  const values = part ? part.values[row.part] : own.values[index];
+  [found.low, found.high] = (part ? part.intervals[row.part]?.[key] : own.intervals[key]?.[place]) ?? [null, null];
+  return { ...found, value: meanOf(chosen.map((i) => values[i])) };
 }
 
-/** The same from a row's own part, which has intervals of single cells, too. */
-function meanOfRow(board, row, metric, selection = EVERYTHING) {
-  if (isSummary(selection)) return mean(board, row, metric, selection);
-  const part = PARTS.get(row.part);
-  const cells = part.cells.filter((cell) => selects(board, selection, cell));
-  const found = { value: null, low: null, high: null, state: "", cells: cells.length, partial: false };
-  const failed = cells.find((cell) => cell.status);
-  if (failed) return { ...found, state: failed.status, reason: failed.reason };
-  const index = board.metrics.indexOf(metric);
-  found.value = meanOf(cells.map((cell) => cell.values[index]));
-  const place = board.intervals.indexOf(metric);
-  const known = part.intervals[keyOf(selection)]?.[place];
-  if (known) [found.low, found.high] = known;
-  else if (cells.length === 1 && place >= 0) [found.low, found.high] = [cells[0].low[place], cells[0].high[place]];
-  return found;
+/** The least mean of the metric that ranks in one environment, and its name. */
+function worst(board, row, selection = EVERYTHING) {
+  if (selection.anomaly === "*") return { value: null, ...row.worst, cells: 1 };
+  const means = Object.keys(board.environments).map((environment) => ({ environment, ...mean(board, row, board.ranking, { ...selection, environment }) }));
+  return means.filter(({ value }) => isNumber(value)).sort((a, b) => a.value - b.value)[0] ?? { value: null, cells: 1 };
 }
 
 /**
@@ -137,23 +132,14 @@ function meanOfRow(board, row, metric, selection = EVERYTHING) {
  * They exist for four detectors at horizon 1 with default settings, by environment and group.
  */
 function paperMean(row, metric, selection = EVERYTHING) {
-  if (row.horizon !== 1 || Object.keys(row.overrides).length || selection.anomaly !== "all") return null;
-  const found = [];
-  for (const [environment, byMetric] of Object.entries(DATA.paper)) {
-    for (const [group, byDetector] of Object.entries(byMetric[metric] ?? {})) {
-      const family = DATA.environments[environment].family;
-      const chosen = ["all", family, environment].includes(selection.environment);
-      if (chosen && ["all", group].includes(selection.group)) found.push(byDetector[row.detector]);
-    }
-  }
+  if (row.horizon !== 1 || Object.keys(row.overrides).length || selection.anomaly[0] !== "*") return null;
+  const found = Object.entries(DATA.paper).filter(([environment]) => ["*", environment].includes(selection.environment))
+    .flatMap(([, byMetric]) => Object.entries(byMetric[metric] ?? {}))
+    .filter(([group]) => ["*", `*${group}`].includes(selection.anomaly)).map(([, byDetector]) => byDetector[row.detector]);
   // One that is missing would make the mean one over other cells.
   if (!found.length || !found.every(isNumber)) return null;
-  const value = meanOf(found);
-  return metric === "auc" ? value / 100 : value;
+  return metric === "auc" ? meanOf(found) / 100 : meanOf(found);
 }
-
-/** Anomalies of a board that belong to a group; those of no group belong to "". */
-const inGroup = (board, group) => board.anomalies.filter((a) => group === "all" || anomalyOf(board, a).group === group);
 
 /** A value as text with marks: a state in place of a failed value, a star for a partial mean. */
 function meanText(found, kind) {
@@ -163,3 +149,17 @@ function meanText(found, kind) {
 
 /** The interval of a mean in brackets, behind a space; nothing where there is none. */
 const intervalOf = ({ low, high }, kind) => isNumber(low) ? ` [${show(low, kind)}, ${show(high, kind)}]` : "";
+
+/** A difference in percentage points with its sign; what is rounded to nothing has none. */
+function signed(share, digits = 1) {
+  if (!isNumber(share)) return UNDEFINED;
+  const size = Math.abs(100 * share).toFixed(digits);
+  return Number(size) ? `${share < 0 ? "\u2212" : "+"}${size}` : size;
+}
+
+/** A tested difference in points and its interval, with digits enough to show whether it leaves out 0. */
+function gapTexts({ difference, low, high, told }) {
+  const ends = [low, high].filter(isNumber);
+  const digits = [1, 2, 3].find((n) => ends[told ? "every" : "some"]((end) => Number((100 * end).toFixed(n)))) ?? 4;
+  return [signed(difference, digits), `[${signed(low, digits)}, ${signed(high, digits)}]`];
+}

@@ -2,17 +2,8 @@
 
 const overview = { columns: "anomaly", cost: "step" };
 
-const COSTS = {
-  step: { title: "scoring", label: "microseconds per scored step" },
-  fit: { title: "fitting", label: "seconds per fit" },
-  peak: { title: "memory", label: "peak memory (MB)" },
-};
-
-/** A row's first line: its name as a link, and whether it is trivial. */
-const rowLink = (row) => element("a", { href: address("detector", row.id) }, breakable(row.label));
-
-/** Rows that stand for their detectors: the primary ones, best first. */
-const primaries = (board) => board.rows.filter((row) => row.primary);
+/** Rows that stand for their detectors: all but variants. */
+const primaries = (board) => board.rows.filter((row) => !row.variant);
 
 const redraw = (draw) => document.getElementById("detector").replaceChildren(...draw.flat().filter(Boolean));
 
@@ -26,7 +17,7 @@ function costPage(board) {
   const ys = drawn.map(({ y }) => 100 * y.value);
   const range = [Math.min(...xs) / 1.5, Math.max(...xs) * 1.5];
   const low = Math.floor(Math.min(50, ...ys) / 10) * 10;
-  const plot = chart(`${rankingTitle(board)} against ${cost.title}`,
+  const plot = chart(`${rankingTitle(board)} against ${cost.title.toLowerCase()}`,
     { range, ticks: [-3, -2, -1, 0, 1, 2, 3, 4, 5].map((p) => 10 ** p).filter((t) => t >= range[0] && t <= range[1]), label: cost.label, bend: Math.log10 },
     { range: [low, 100], ticks: ticks(low, 100), label: `${rankingName(board)} (%)` }, { width: 860, height: 480, class: "wide" });
   plot.drawing.setAttribute("role", "group");
@@ -41,9 +32,9 @@ function costPage(board) {
   }
   return [
     element("h1", { tabindex: "-1" }, "Quality and cost"),
-    element("p", { class: "lead" }, `${boardTitle(board)} \u00b7 one row a detector. Entries were measured on different machines: compare orders of magnitude.`),
+    element("p", { class: "lead" }, `${board.title} \u00b7 one row a detector. Rows may have been measured on different machines: compare orders of magnitude.`),
     element("form", { class: "choices", autocomplete: "off" },
-      tabs("cost-axis", "Cost of", Object.entries(COSTS).map(([key, { title }]) => [key, title]), overview.cost, again),
+      tabs("cost-axis", "Cost of", Object.entries(COSTS).map(([key, { title }]) => [key, title.toLowerCase()]), overview.cost, again),
       csvButton("quality-and-cost", () => document.getElementById("costs"))),
     figure([plot.drawing], [], "Up and to the left is better: more is found, for less."),
     element("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "Quality and cost as a table" }, tableOf({ class: "plain", id: "costs" },
@@ -83,17 +74,15 @@ function labelPlace(x, y, text, plot, taken) {
 function heatPage(board) {
   const again = (value) => { overview.columns = value; redraw(heatPage(board)); };
   const columns = {
-    anomaly: board.anomalies.map((anomaly) => ({ title: anomalyOf(board, anomaly).title, hint: anomalyOf(board, anomaly).summary, selection: { ...EVERYTHING, anomaly } })),
-    environment: board.environments.map((environment) => ({ title: environmentOf(board, environment).title, selection: { ...EVERYTHING, environment } })),
-    cell: board.cells.map(([environment, anomaly]) => ({
-      title: cellTitle(board, { environment, anomaly }), selection: { environment, group: "all", anomaly }, cell: [environment, anomaly],
-    })),
+    anomaly: Object.entries(board.anomalies).map(([anomaly, { title, summary }]) => ({ title, hint: summary, selection: { environment: "*", anomaly } })),
+    environment: Object.entries(board.environments).map(([environment, title]) => ({ title, selection: { environment, anomaly: "*" } })),
+    cell: board.cells.map(([environment, anomaly]) => ({ title: cellTitle(board, { environment, anomaly }), selection: { environment, anomaly }, cell: [environment, anomaly] })),
   }[overview.columns];
   const rows = primaries(board);
   const options = [["anomaly", "Anomalies"], ["environment", "Environments"], ["cell", "Cells"]];
   return [
     element("h1", { tabindex: "-1" }, "Detectors by cells"),
-    element("p", { class: "lead" }, `${boardTitle(board)} \u00b7 ${rankingName(board)} (%), one row a detector`),
+    element("p", { class: "lead" }, `${board.title} \u00b7 ${rankingName(board)} (%), one row a detector`),
     element("form", { class: "choices", autocomplete: "off" }, tabs("heat-columns", "Columns", options, overview.columns, again),
       csvButton("heatmap", () => document.getElementById("heatmap"))),
     element("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "Heat map" },

@@ -8,21 +8,21 @@ const POWER_AXES = {
   lost: { title: "return lost", place: 1, label: "return lost (%)" },
 };
 
-/** The page of detection thresholds and of power against strength. */
+/** The page of further suites: detection thresholds and power against strength, and tables of the others. */
 function powerPage() {
-  const metrics = DATA.power[0].metrics.map((metric, i) => [i, metric.title]);
+  const metrics = DATA.suites[0].metrics.map((metric, i) => [i, metric.title]);
   const axes = Object.entries(POWER_AXES).map(([name, axis]) => [name, `over ${axis.title}`]);
-  const labels = [...new Set(DATA.power.flatMap((suite) => suite.rows.filter((row) => !row.trivial).map((row) => row.label)))];
+  const labels = [...new Set(DATA.suites.flatMap((suite) => suite.rows.filter((row) => !row.trivial).map((row) => row.label)))];
   if (!power.hidden) {
-    const first = DATA.power.flatMap((suite) => suite.rows.filter((row) => !row.trivial).slice(0, POWER_SHOWN).map((row) => row.label));
+    const first = DATA.suites.flatMap((suite) => suite.rows.filter((row) => !row.trivial).slice(0, POWER_SHOWN).map((row) => row.label));
     power.hidden = new Set(labels.filter((label) => ![...first, "riqn"].includes(label)));
   }
   const again = () => document.getElementById("detector").replaceChildren(...powerPage());
   const set = (name) => (value) => { power[name] = value; again(); };
   return [
-    element("h1", { tabindex: "-1" }, "Weaker anomalies"),
-    element("p", { class: "lead" }, "What rows find of anomalies that cost a policy less and less of its return, and the weakest strength that they find: their detection threshold."),
-    element("form", { class: "choices", "aria-label": "What to draw", autocomplete: "off" },
+    element("h1", { tabindex: "-1" }, "Weaker anomalies, worlds, logs"),
+    element("p", { class: "lead" }, "What rows find of anomalies that cost a policy less and less of its return, with the weakest strength that they find, their detection threshold; then rows on other nominal operation and on public logs. The project ran all of them; nothing here is ranked."),
+    labels.length ? element("form", { class: "choices", "aria-label": "What to draw", autocomplete: "off" },
       tabs("power-metric", "Measure", metrics, power.metric, set("metric")), tabs("power-axis", "Drawn", axes, power.axis, set("axis")),
       element("fieldset", { class: "boxes" }, element("legend", {}, "Rows"), labels.map((label) => element("label", {}, element("input", {
         type: "checkbox", name: "power-row", value: label, checked: !power.hidden.has(label),
@@ -32,10 +32,14 @@ function powerPage() {
           again();
           document.querySelector(`[name="power-row"][value="${CSS.escape(label)}"]`).focus();
         },
-      }), ` ${label}`)))),
-    element("section", { id: "power", "aria-label": "Detection power" }, DATA.power.flatMap(powerOf)),
+      }), ` ${label}`)))) : "",
+    element("section", { id: "power", "aria-label": "Further suites" }, DATA.suites.map(suitePart)),
   ];
 }
+
+/** A suite under its heading; where it is not graded, its tables alone, folded. */
+const suitePart = (suite) => element("details", { open: suite.rows.length > 0 },
+  element("summary", {}, element("h2", {}, [...new Set([suite.name, suite.split])].join(": "))), suite.rows.length ? powerOf(suite) : suite.tables.map(powerTable));
 
 /** Chart and tables of one split with graded strengths. */
 function powerOf(suite) {
@@ -77,9 +81,7 @@ function powerOf(suite) {
 const powerLine = (plot, row, axis, kind) =>
   line(plot, row.points.map((p) => (axis.bend ? 1 : 100) * p[axis.place]), row.points.map((p) => 100 * p[2]), kind);
 
-function powerTable({ title, note, header, rows }, i) {
-  const id = `power-table-${i}`;
-  return element("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": title },
-    csvButton(`thresholds-${i + 1}`, () => document.getElementById(id)),
-    tableOf({ class: "plain", id }, `${title}. ${note}`, header, rows.map(([label, ...cells]) => lineOf(label, cells))));
+function powerTable({ title, note, header, rows }) {
+  const table = tableOf({ class: "plain" }, `${sentence(title)} ${note}`, header, rows.map(([label, ...cells]) => lineOf(label, cells)));
+  return element("div", { class: "scroll", tabindex: 0, role: "group", "aria-label": "Scrolls sideways" }, csvButton("suite", () => table), table);
 }
