@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import helpers_site
@@ -284,11 +285,22 @@ def test_selections_are_those_that_the_filters_can_make():
     assert found["ant|*"] == cells[:2]
 
 
-def test_names_of_plugins_environments_and_strengths_are_shown(page):
-    data, _ = site_data((), (), [helpers_site.season()])
+def test_environments_and_anomalies_of_plugins_and_strengths_have_their_names(tmp_path, page):
+    records = [
+        replace(record, environment="arm", anomaly="payload", strength="kept90")
+        for record in helpers_site.row_records(
+            "riqn", rng=np.random.default_rng(0), cells=[("hopper", "gravity")]
+        )
+    ]
+    data, _ = site_data(sections([helpers_site.report(tmp_path, "one", records)]))
     (board,) = data["boards"]
+    assert board["environments"] == {"arm": "arm"}
+    assert board["anomalies"] == {
+        "payload": {"title": "payload", "summary": "", "group": "dynamics"}
+    }
+    assert board["strengths"] == {"arm|payload": "kept90"}
+    (board, *_) = embedded(page)["boards"]
     assert board["environments"] == {"cartpole": "CartPole", "hopper": "Hopper"}
-    assert board["anomalies"]["gravity"]["group"] == "dynamics"
     assert set(board["strengths"].values()) == {""}
 
 

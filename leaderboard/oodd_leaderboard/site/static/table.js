@@ -61,8 +61,10 @@ const COSTS = {
 
 /** The five columns; with one environment a column an anomaly takes the place of the worst environment. */
 function headline(board, selection) {
-  const one = selection.environment !== "*" || Object.keys(board.environments).length === 1;
+  const environments = selection.environment === "*" ? Object.keys(board.environments) : [selection.environment];
+  const one = environments.length === 1;
   const anomalies = one ? selectedAnomalies(board, selection) : [];
+  const strength = (anomaly) => board.strengths[`${environments[0]}|${anomaly}`];
   const least = {
     key: "worst", title: "Worst environment", unit: "%", hint: `The least mean of ${rankingName(board)} in one environment, and which it is`, better: "higher", kind: "percent", marked: true,
     needs: ({ anomaly }) => anomaly === "*" ? [] : known(board, [board.ranking]),
@@ -74,7 +76,7 @@ function headline(board, selection) {
   return [
     ...known(board, [board.ranking]).map((metric) => metricColumn(board, metric, { interval: true, whisker: !one, unit: "% [95\u00a0%]" })),
     ...!board.parts[board.ranking] ? [] : !one ? [least] : anomalies.length < 2 ? [] : anomalies.map((anomaly) =>
-      metricColumn(board, board.ranking, { key: `of-${anomaly}`, title: anomalyOf(board, anomaly).title, hint: `${rankingTitle(board)} under ${anomalyOf(board, anomaly).title}`, within: { anomaly } })),
+      metricColumn(board, board.ranking, { key: `of-${anomaly}`, title: anomalyOf(board, anomaly).title, unit: ["%", strength(anomaly)].filter(Boolean).join(", "), hint: `${rankingTitle(board)} under ${anomalyOf(board, anomaly).title}`, within: { anomaly } })),
     ...alarms,
   ];
 }
@@ -350,6 +352,7 @@ function notesOf(board, rows) {
   const lines = [
     board.ranked && !selectsAll(board) && "Ranks are those over all cells of the board, whatever is selected.",
     board.ranked && rows.some((row) => row.seeds.length > 1) && `Every row has the same detector seeds (${board.season.seeds.join(", ")}), or one seed where it has no randomness. Intervals are over test episodes.`,
+    Object.values(board.strengths).some(Boolean) && "Every cell has a strength of its own, which its column in one environment and its page name: means are over these strengths.",
     ...board.about,
     rows.some((row) => mean(board, row, board.ranking, state).partial) && "* A mean over fewer cells than other rows have.",
   ];
