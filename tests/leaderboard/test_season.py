@@ -68,6 +68,13 @@ def test_a_season_is_whole_when_every_row_has_every_cell(whole, entries):
     }  # fmt: skip
 
 
+def test_a_whole_season_has_a_page_and_a_site(whole):
+    page = (whole / "README.md").read_text()
+    assert "no board" in page  # a trial
+    assert all(name in page for name in (*ROWS, "short", BITS))
+    assert (whole / "site" / "index.html").is_file()
+
+
 def test_rows_without_all_cells_are_told(whole):
     read = read_season(whole)
     records = read.records(whole)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from helpers_entries import write_entry, write_plugin_entry, write_wheel
 from oodd_leaderboard.season_files import read_season
+from oodd_leaderboard.standings import ordered
 
 from oodd_eval import load_split
 from oodd_eval.cli.main import main
@@ -176,6 +177,14 @@ def test_no_cheat_gains_against_the_row_that_it_hides(played, name):
     else:
         expected = [honest[record.position].value("auc_matched") for record in mine]
         assert values == pytest.approx(expected, abs=0.005)
+
+
+def test_a_copy_pushes_the_row_that_it_copies_to_no_lower_rank(played):
+    read, records, _ = played
+    board = ordered(records, read.entries, expected=read.expected)
+    ranks = {standing.entry.detector: standing.rank for standing in board.standings}
+    assert ranks["near"] == ranks[HONEST] == 1
+    assert all(ranks[name] is None for name in CHEATS)  # variants
 
 
 def test_nothing_of_a_strangers_wheel_runs_in_the_command(played):

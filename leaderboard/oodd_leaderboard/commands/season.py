@@ -3,7 +3,7 @@
 import re
 import secrets
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Final
 
@@ -36,6 +36,7 @@ from oodd_eval.scoring.display import Display
 from oodd_eval.scoring.executors import RunSettings, check_executor
 from oodd_leaderboard import season as running
 from oodd_leaderboard.entry import read_entries
+from oodd_leaderboard.pages import build_season
 from oodd_leaderboard.sandbox.launcher import make_sandbox
 from oodd_leaderboard.season_files import SEASON, SPLIT, read_season, row_path
 
@@ -144,13 +145,10 @@ def _run(runner: running.SeasonRunner, console: Console, *, quiet: bool) -> int:
     if lines := runner.season.missing(records):
         return say(f"the season is not whole: {'; '.join(lines)}", 1)
     runner.season = running.end(runner.season, runner.directory)
-    build(runner.directory)
+    with console.status("page and site") if console.is_terminal else nullcontext():
+        build_season(runner.directory)
     console.print(f"season {runner.season.name} is whole: {runner.directory}")
     return int(not all(record.ok for record in records))
-
-
-def build(directory: Path) -> None:
-    """Build page, tables and site of a season that is whole."""
 
 
 def _outcome(records: Sequence[Record]) -> str:
