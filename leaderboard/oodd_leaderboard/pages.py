@@ -76,8 +76,8 @@ def read_leaderboard(directory: Path) -> Leaderboard:
     if (directory / SEASON).is_file():
         return Leaderboard([read_season_board(directory)], alone=True)
     entries = entries_of(directory)
-    found = sections(read_reported(directory), by_detector(entries))
-    return Leaderboard(read_seasons(directory), found, suite_sections(directory), entries)
+    reported = sections(read_reported(directory), by_detector(entries))
+    return Leaderboard(read_seasons(directory), reported, suite_sections(directory), entries)
 
 
 def build(

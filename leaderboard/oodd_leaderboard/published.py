@@ -120,13 +120,15 @@ def read_published(file: Path | None = None) -> list[PublishedBoard]:
         raise ResultsError(
             f"{str(file)!r} was written by another version of oodd-eval: run leaderboard build"
         ) from None
-    season, entries = head.season, head.entries
-    found = []
+    reported = by_detector(head.entries.values())
+    published = []
     for board in boards(read_records(file, matches=lambda line: not line.startswith('{"entries"'))):
-        of_season = season is not None and board.digest == season.split.digest
-        named = season.entries if of_season else by_detector(entries.values())
-        found.append(PublishedBoard(board.records, named, season if of_season else None))
-    return sorted(found, key=lambda board: board.season is None)
+        season = head.season
+        if season is not None and board.digest == season.split.digest:
+            published.append(PublishedBoard(board.records, season.entries, season))
+        else:
+            published.append(PublishedBoard(board.records, reported, None))
+    return sorted(published, key=lambda board: board.season is None)
 
 
 def board_of(records: Sequence[Record], among: Iterable[PublishedBoard]) -> PublishedBoard:

@@ -202,10 +202,10 @@ def sections(
                     f"split digest {record.split_digest[:12]}, expected one: remove one of them"
                 )
             records.append(record)
-    found = []
+    by_board = []
     for board in boards(records):
         ranks = ordered(board.records, entries, ranked=False)
         of_board = board.digest, board.protocol, board.limit
         sources = {row.entry: owners[row.entry, *of_board] for row in ranks.standings}
-        found.append(LeaderboardSection(ranks, sources, entries))
-    return sorted(found, key=lambda section: section.order)
+        by_board.append(LeaderboardSection(ranks, sources, entries))
+    return sorted(by_board, key=lambda section: section.order)

@@ -405,8 +405,8 @@ def _intervals(
     for (i, metric), (key, cells) in product(enumerate(metrics), filtered.items()):
         held = once.get(cells[0], []) if len(cells) == 1 else []
         if len(held) == 1:
-            found = held[0].metrics.get(metric)
-            low, high = (found.low, found.high) if found else (NAN, NAN)
+            interval = held[0].metrics.get(metric)
+            low, high = (interval.low, interval.high) if interval else (NAN, NAN)
         elif metric in always or key in SUMMARIES:
             mean = board.mean(standing.entry, *_sides(cells), metric, intervals=True)
             low, high = mean.low, mean.high
