@@ -50,8 +50,8 @@ def main():
     for name, records in sources.items():
         for board in boards(records):
             tests = verdicts(board)
-            told = sum(test.told for test in tests)
-            disagree = [test for test in tests if test.told != (test.p <= ALPHA)]
+            told = sum(test.told_apart for test in tests)
+            disagree = [test for test in tests if test.told_apart != (test.p <= ALPHA)]
             wrong += len(disagree)
             print(f"{name}, {board.conditions}: {len(tests)} tests, {told} told, "
                   f"{len(disagree)} disagree", *disagree, sep="\n", flush=True)  # fmt: skip

@@ -115,18 +115,18 @@ _RECORD: Final[Mapping[str, Rule]] = {
 }
 
 
-def check_record(record: Record, place: str) -> None:
+def check_record(record: Record, location: str) -> None:
     """Raise `ResultsError` for the first field of a record that a board cannot show.
 
     Parameters
     ----------
     record
         As it was read.
-    place
+    location
         File and line, for the message.
     """
     for field, problem in _problems(record):
-        raise ResultsError(f"{place}: {field}: {problem}")
+        raise ResultsError(f"{location}: {field}: {problem}")
 
 
 def _problems(record: Record) -> Iterator[tuple[str, str]]:

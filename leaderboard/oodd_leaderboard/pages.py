@@ -259,7 +259,7 @@ def first_rows(ranks: OrderedBoard) -> list[str]:
     test, phrase = ranks.first[second.entry], metric_info(ranks.board.ranking).phrase
     band = [str(row.entry) for row in places if row.band]
     amount = difference_text(test, ranks.board.ranking)
-    if test.told:
+    if test.told_apart:
         return [f"{best.entry} is first in {phrase}: it beats {second.entry} by {amount}."]
     return [f"{', '.join(band)} share the first rank in {phrase}: no difference is shown."]
 

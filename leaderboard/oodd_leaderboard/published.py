@@ -17,7 +17,7 @@ from pydantic import TypeAdapter, ValidationError
 from oodd_eval.data.files import read_text
 from oodd_eval.errors import ResultsError, UsageError
 from oodd_eval.metrics.catalogue import FOUND_WITHIN, UNDEFINED, metric_info
-from oodd_eval.metrics.ranking import Difference, Position
+from oodd_eval.metrics.ranking import PairedDifference, Position
 from oodd_eval.prose import Table
 from oodd_eval.results.board import Conditions, boards, expected_cells, grouped, level_of, ranked_by
 from oodd_eval.results.directory import read_records
@@ -246,7 +246,7 @@ def board_table(ranks: OrderedBoard, marked: Collection[Setting] = ()) -> Table 
     labels = {}
     for row in ranks.standings:
         named = [printed_name(row, marked), _whose(row)]
-        labels[row.entry] = [row.place, *named] if placed else named
+        labels[row.entry] = [row.printed_rank, *named] if placed else named
     return Tables(ranks.board, labels=labels, label_names=header).headline()
 
 
@@ -261,7 +261,7 @@ def _whose(row: Standing) -> str:
     return ", ".join(filter(None, [ORIGINS[row.origin], year]))
 
 
-def difference_text(test: Difference, metric: str) -> str:
+def difference_text(test: PairedDifference, metric: str) -> str:
     """Return a difference with its interval in the metric's unit; an end may be missing."""
     info = metric_info(metric)
     unit = {"percent": " points", "steps": " steps"}.get(info.unit, "")

@@ -32,9 +32,6 @@ def read_season_board(directory: Path) -> SeasonBoard:
     `ResultsError`: rows lack environments, and the message has a line for each of them.
     """
     season = read_season(directory)
-    lacks = lacking(season)
-    if lacks and not season.trial:
-        raise ResultsError(f"season {season.name} is no board: it lacks {', '.join(lacks)}")
     records = season.records(directory)
     if missing := season.missing(records):
         listed = "\n  ".join(missing)
@@ -43,18 +40,19 @@ def read_season_board(directory: Path) -> SeasonBoard:
             "run leaderboard season again, which goes on where it stopped"
         )
     ranks = ordered(records, season.entries, expected=season.expected)
-    return SeasonBoard(season, ranks, lacks)
+    return SeasonBoard(season, ranks, lacking(season))
 
 
 def lacking(season: Season) -> list[str]:
     """Return what a trial lacks of a season; nothing for a season."""
+    if not season.trial:
+        return []
     absent = [e for e in (*ENVIRONMENTS, *WORLDS) if e not in season.environments]
-    sizes = ["the sizes of a season"] if season.trial and not absent else []
-    return [f"environments {', '.join(absent)}"] if absent else sizes
+    return [f"environments {', '.join(absent)}"] if absent else ["the sizes of a season"]
 
 
 def read_seasons(leaderboard: Path) -> list[SeasonBoard]:
     """Read the seasons of a leaderboard's directory, the newest first."""
     paths = [path.parent for path in (leaderboard / SEASONS).glob(f"*/{SEASON}")]
-    boards = map(read_season_board, sorted(paths))
-    return sorted(boards, key=lambda board: board.season.date, reverse=True)
+    seasons = map(read_season_board, sorted(paths))
+    return sorted(seasons, key=lambda board: board.season.date, reverse=True)

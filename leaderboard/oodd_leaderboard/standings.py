@@ -16,7 +16,7 @@ from typing import Any, Final, NamedTuple
 from oodd_eval.errors import ResultsError
 from oodd_eval.metrics.bootstrap import nan_mean
 from oodd_eval.metrics.catalogue import UNDEFINED, metric_info
-from oodd_eval.metrics.ranking import Difference, Position, differences
+from oodd_eval.metrics.ranking import PairedDifference, Position, differences
 from oodd_eval.names import counted
 from oodd_eval.plugins.contract import Training, training_mark
 from oodd_eval.results.board import Board, cells_with, expected_cells, grouped
@@ -90,7 +90,7 @@ class Standing:
     cost: Cost
 
     @property
-    def place(self) -> str:
+    def printed_rank(self) -> str:
         """The rank as printed, ``3 =`` where the row is not told from the row above it."""
         if self.rank is None:
             return UNDEFINED
@@ -109,7 +109,7 @@ class Standing:
         overrides = [f"{k}={v}" for k, v in self.entry.overrides.items()]
         several = [f"{self.seeds} seeds"] if self.seeds > 1 else []
         settings = ", ".join([f"Δ={self.entry.horizon}", *overrides, *several])
-        return [self.place, self.entry.detector + self.marks, settings]
+        return [self.printed_rank, self.entry.detector + self.marks, settings]
 
 
 @dataclass(frozen=True)
@@ -128,8 +128,8 @@ class OrderedBoard:
 
     board: Board
     standings: list[Standing]
-    above: dict[Setting, Difference]
-    first: dict[Setting, Difference]
+    above: dict[Setting, PairedDifference]
+    first: dict[Setting, PairedDifference]
 
     @functools.cached_property
     def tables(self) -> Tables:
@@ -199,7 +199,7 @@ def ordered(
     if above:  # both families hold the pair of the first two rows: the larger p-value counts
         second = places[1]
         above[second] = first[second] = max(above[second], first[second], key=lambda d: d.p)
-    band = [e for e in places if e not in first or not first[e].told]
+    band = [e for e in places if e not in first or not first[e].told_apart]
     ranks = {e: 1 if e in band else i for i, e in enumerate(places, 1)}
     standings = []
     for row in order:
@@ -208,7 +208,7 @@ def ordered(
             entry=row,
             records=by_row[row],
             rank=ranks.get(row),
-            equal=row in above and not above[row].told,
+            equal=row in above and not above[row].told_apart,
             band=row in band,
             state=states[row],
             variant=row in variants,
@@ -261,7 +261,7 @@ def cost_of(records: Iterable[Record]) -> Cost:
 
 def _tested(
     terms: Mapping[str, Any], rows: Sequence[Setting], pairs: Iterable[tuple[Setting, Setting]]
-) -> dict[Setting, Difference]:
+) -> dict[Setting, PairedDifference]:
     """Return the tests of pairs by their second rows."""
     named = [(str(a), str(b)) for a, b in pairs]
     return dict(zip(rows, differences(terms, named), strict=True)) if named else {}

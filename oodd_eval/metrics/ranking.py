@@ -34,7 +34,7 @@ Row = Mapping[int, Mapping[Position, Contribution]]  # by detector seed and cell
 
 
 @dataclass(frozen=True, slots=True)
-class Difference:
+class PairedDifference:
     """A row's mean minus another's.
 
     Attributes
@@ -58,14 +58,14 @@ class Difference:
     p: float
 
     @property
-    def told(self) -> bool:
+    def told_apart(self) -> bool:
         """Whether the rows are told apart: the interval leaves out 0, and so p is at most 0.05."""
         return self.low > 0 or self.high < 0
 
 
 def differences(
     rows: Mapping[str, Row], pairs: Sequence[tuple[str, str]], *, resamples: int | None = None
-) -> list[Difference]:
+) -> list[PairedDifference]:
     """Test pairs of rows together, with the same results for any order of pairs, seeds and cells.
 
     Parameters
@@ -79,7 +79,7 @@ def differences(
 
     Returns
     -------
-    list of Difference
+    list of PairedDifference
         One a pair, in the order of the pairs.
 
     Raises
@@ -117,7 +117,7 @@ def differences(
     if (failed := corrected > ALPHA).any():
         steps[failed] = steps[failed].max()
     return [
-        Difference(a, b, test.difference, *test.ends(int(step)), float(corrected_p))
+        PairedDifference(a, b, test.difference, *test.ends(int(step)), float(corrected_p))
         for (a, b), test, step, corrected_p in zip(pairs, tests, steps, corrected, strict=True)
     ]
 

@@ -51,8 +51,8 @@ class PairedComparison:
     values
         Means of both over the cells.
     difference, low, high, p
-        As a `Difference`, but in the metric's own sign: with the paired 95 % interval, whose ends
-        are NaN where there are too few test seeds for one.
+        As a `PairedDifference`, but in the metric's own sign: with the paired 95 % interval,
+        whose ends are NaN where there are too few test seeds for one.
     cells
         Cells that both rows have, over which the means are.
     environments

@@ -469,8 +469,8 @@ def best_first(board: Board) -> list[Setting]:
     Where no record has it, as in some graded suites, the share that is found decides. Rows without
     a value in some expected cell come last.
     """
-    found = f"found_within_{catalogue.FOUND_WITHIN[-1]}_{board.level}"
-    metric = found if board.leaves_out([board.ranking]) else board.ranking
+    share_found = f"found_within_{catalogue.FOUND_WITHIN[-1]}_{board.level}"
+    metric = share_found if board.leaves_out([board.ranking]) else board.ranking
     means = {entry: board.of(entry, Column(metric)) for entry in board.entries}
 
     def order(entry: Setting) -> tuple[bool, float, str]:

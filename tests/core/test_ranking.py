@@ -76,7 +76,7 @@ def test_p_value_and_interval_are_those_of_all_resamples_counted_out():
     same = one(row(shifts[:7] + 0.25), row(shifts[:7]), resamples=2000)
     assert (same.p, same.difference) == pytest.approx((2.0**-6, 0.25))
     assert (same.low, same.high) == pytest.approx((0.25, 0.25))
-    assert same.told
+    assert same.told_apart
 
 
 def test_holm_steps_decide_levels_of_intervals():
@@ -101,10 +101,10 @@ def test_holm_steps_decide_levels_of_intervals():
         failed = failed or (3 - step if running > ALPHA else None)
         wider = together[i].high - together[i].low >= alone[i].high - alone[i].low
         assert wider if level_of > 1 else together[i].high == alone[i].high
-    assert [test.told for test in together] == [test.p <= ALPHA for test in together]
+    assert [test.told_apart for test in together] == [test.p <= ALPHA for test in together]
     # Alone both are told apart; of three pairs neither is, since the second step asks for 0.025.
-    assert [test.told for test in alone] == [True, True, True]
-    assert [test.told for test in together] == [True, False, False]
+    assert [test.told_apart for test in alone] == [True, True, True]
+    assert [test.told_apart for test in together] == [True, False, False]
 
 
 @settings(max_examples=25, deadline=None)
@@ -119,8 +119,8 @@ def test_told_is_p_of_at_most_five_percent_for_any_order(seed, n, count, step):
     rows |= {"copy": rows["r0"], "constant": row([0.5] * n, cells)}
     pairs = [*itertools.pairwise(rows), ("copy", "r0")]
     tests = differences(rows, pairs, resamples=500)
-    assert all(test.told == (test.p <= ALPHA) for test in tests)
-    assert not tests[-1].told
+    assert all(test.told_apart == (test.p <= ALPHA) for test in tests)
+    assert not tests[-1].told_apart
     assert tests[-1].p == 1
     reordered = {
         name: {s: dict(reversed(c.items())) for s, c in reversed(r.items())}
@@ -140,11 +140,11 @@ def test_told_is_p_of_at_most_five_percent_for_any_order(seed, n, count, step):
 def test_too_few_test_seeds_for_any_verdict_give_no_interval():
     five = one(row([0.9, 0.91, 0.92, 0.9, 0.93]), row([0.1] * 5), resamples=2000)
     assert five.p == 2.0**-4
-    assert not five.told
+    assert not five.told_apart
     assert math.isnan(five.low)
     assert math.isnan(five.high)
     single = one(row([0.9]), row([0.1]))
-    assert (single.p, single.told) == (1.0, False)
+    assert (single.p, single.told_apart) == (1.0, False)
     assert math.isnan(single.low)
 
 
@@ -158,7 +158,7 @@ def test_detector_seeds_are_fixed():
     assert (both.difference, both.low, both.high, both.p) == pytest.approx(
         (expected.difference, expected.low, expected.high, expected.p)
     )
-    assert both.told
+    assert both.told_apart
 
 
 @pytest.mark.parametrize(("environments", "tables"), [(1, 200), (4, 100)])
@@ -177,7 +177,7 @@ def test_of_equal_rows_few_are_told_apart(environments, tables):
         families = [*itertools.pairwise(order)], [(order[0], name) for name in order[1:]]
         for i, pairs in enumerate(families):
             tests = differences(rows, pairs, resamples=1000)
-            wrong[i] += any(t.told for t in tests if i == 0 or t.second == "d0")
+            wrong[i] += any(t.told_apart for t in tests if i == 0 or t.second == "d0")
     # 5 % expected; three standard errors more would come by chance in a suite of a thousand.
     assert (wrong / tables <= 0.05 + 3 * math.sqrt(0.05 * 0.95 / tables)).all(), wrong / tables
 

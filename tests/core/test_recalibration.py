@@ -195,9 +195,9 @@ def test_calibration_noise_of_both_rows_decides_a_verdict_and_common_noise_does_
             "a": contributions(first, both[0] * noise), "b": contributions(second, both[1] * noise)
         }  # fmt: skip
         (names[kind],) = differences(rows, [("a", "b")])
-    assert names["none"].told
+    assert names["none"].told_apart
     assert names["common"] == names["none"]
-    assert not names["apart"].told
+    assert not names["apart"].told_apart
     assert names["apart"].low < 0 < names["none"].low
 
 

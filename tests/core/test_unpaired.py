@@ -512,9 +512,9 @@ def rows_of(shifts, metric=pool_of, m=20, n=25):
 def test_rows_without_twins_are_told_apart_by_both_samples():
     rows = rows_of({"good": 1.5, "poor": 0.0, "same": 1.5})
     told, equal = differences(rows, [("good", "poor"), ("good", "same")], resamples=2000)
-    assert told.told
+    assert told.told_apart
     assert told.low < told.difference < told.high
-    assert (equal.low, equal.high, equal.told) == (0.0, 0.0, False)
+    assert (equal.low, equal.high, equal.told_apart) == (0.0, 0.0, False)
 
 
 def test_rows_of_other_samples_cannot_be_compared():

@@ -65,7 +65,7 @@ def test_places_say_what_is_told_apart(season):
     assert [lines[name]["rank"] for name in ("riqn", "oracle", "broken")] == ["1", "", ""]
     for row in season.ranks.standings:
         test = season.ranks.above.get(row.entry)
-        assert row.equal == (test is not None and not test.told)
+        assert row.equal == (test is not None and not test.told_apart)
         line = lines[row.entry.detector]
         if row.rank and row.rank > 1:
             assert float(line["first_low"]) > 0
@@ -128,8 +128,8 @@ def test_the_file_has_the_last_season_and_reported_rows_in_their_order(shipped, 
     assert [board.season and board.season.name for board in shipped] == ["2026-11", None, None]
     for board, ranks in zip(shipped, [season.ranks, *(s.ranks for s in reported)], strict=True):
         again = board.ranks()
-        assert [(s.entry, s.place, s.origin) for s in again.standings] == [
-            (s.entry, s.place, s.origin) for s in ranks.standings
+        assert [(s.entry, s.printed_rank, s.origin) for s in again.standings] == [
+            (s.entry, s.printed_rank, s.origin) for s in ranks.standings
         ]
         assert again.first == ranks.first
 

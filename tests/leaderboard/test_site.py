@@ -187,7 +187,7 @@ def test_rows_have_the_ranks_and_tests_of_the_board(season, page):
             test = getattr(season.ranks, name).get(standing.entry)
             assert (found[name] is None) == (test is None)
             if test:
-                assert (found[name]["row"], found[name]["told"]) == (test.first, test.told)
+                assert (found[name]["row"], found[name]["told"]) == (test.first, test.told_apart)
                 ends = [found[name][end] for end in ("difference", "low", "high")]
                 assert ends == pytest.approx([test.difference, test.low, test.high], rel=1e-5)
     assert row(page, "oracle")["rank"] is None

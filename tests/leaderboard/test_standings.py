@@ -34,7 +34,7 @@ def row(name, mean, noise=0, *, cells=CELLS, seeds=(0,), **facts):
 
 
 def places(board):
-    return [(s.place, s.entry.detector) for s in board.standings]
+    return [(s.printed_rank, s.entry.detector) for s in board.standings]
 
 
 def test_rows_stand_by_mean_and_the_first_band_shares_the_first_rank():
@@ -47,7 +47,7 @@ def test_rows_stand_by_mean_and_the_first_band_shares_the_first_rank():
     assert {d.first for d in board.first.values()} == {"a"}
     for entry, difference in (*board.above.items(), *board.first.items()):
         assert difference.second == str(entry)
-        assert difference.told == (difference.p <= 0.05)
+        assert difference.told_apart == (difference.p <= 0.05)
     # The pair of the first two rows has one verdict.
     second = board.standings[1].entry
     assert board.above[second] == board.first[second]
@@ -129,7 +129,9 @@ def test_committed_rows_have_one_verdict(directory):
     for board in boards(ResultsDirectory(root).records())[:3]:
         made = ordered(board.records)
         differences = [*made.above.values(), *made.first.values()]
-        assert all(d.told == (d.p <= 0.05) for d in differences)
+        assert all(d.told_apart == (d.p <= 0.05) for d in differences)
         assert all(
-            s.band != made.first[s.entry].told for s in made.standings if s.entry in made.first
+            s.band != made.first[s.entry].told_apart
+            for s in made.standings
+            if s.entry in made.first
         )

@@ -143,8 +143,8 @@ def _sentences(placed: Placement) -> list[str]:
         text = f"{row} stands at place {i} of {len(standings)} by mean {metric.noun}"
         text += f", rank {standing.rank}." if standing.rank else "."
         if test := placed.ranks.above.get(row):
-            told = "told" if test.told else "not told"
-            text += f" It is {told} from {test.first}, the row above it: "
+            verdict = "told" if test.told_apart else "not told"
+            text += f" It is {verdict} from {test.first}, the row above it: "
             text += f"{difference_text(test, metric.name)} below it."
         if row in placed.published:
             text += " The board has that row with the same numbers."

@@ -27,7 +27,7 @@ from oodd_eval.data.split import SHIPPED, Split
 from oodd_eval.metrics.bootstrap import nan_mean
 from oodd_eval.metrics.catalogue import HEADLINE, METRICS, NAMES, RANKING, metric_info
 from oodd_eval.metrics.cusum import DRIFT, THRESHOLD
-from oodd_eval.metrics.ranking import Difference
+from oodd_eval.metrics.ranking import PairedDifference
 from oodd_eval.results.board import Board, grouped
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import NAN, Record
@@ -76,7 +76,7 @@ SelectedCell = tuple[str, str]  # environment and anomaly
 
 
 @dataclass(frozen=True, slots=True)
-class _Shown:
+class _SiteBoard:
     """A season's board or a table of reported rows: what stands at its head, and its rows."""
 
     id: str
@@ -118,8 +118,8 @@ def site_data(
     sources = {source.name: source for section in sections for source in section.sources.values()}
     units = {name: read_curves(s.curves)["units"] for name, s in sources.items() if s.curves}
     parts: dict[str, Json] = {}
-    shown = [*map(_of_season, newest_first(seasons)), *_of_reported(sections)]
-    boards = [_board(table, units, parts) for table in shown]
+    tables = [*map(_of_season, newest_first(seasons)), *_of_reported(sections)]
+    boards = [_board(table, units, parts) for table in tables]
     names = dict.fromkeys(name for b in boards for name in (*b["metrics"], b["ranking"]))
     data = {
         "threshold": THRESHOLD,
@@ -140,7 +140,7 @@ def _day(iso: str) -> str:
     return f"{day.day} {month_name[day.month]} {day.year}"
 
 
-def _of_season(board: SeasonBoard) -> _Shown:
+def _of_season(board: SeasonBoard) -> _SiteBoard:
     season = board.season
     name = f"{'Trial' if season.trial else 'Season'} {season.name}"
     lacking = f": no board, since it lacks {', '.join(board.lacks)}" if season.trial else ""
@@ -151,19 +151,19 @@ def _of_season(board: SeasonBoard) -> _Shown:
         }
     }
     texts = (board.name, name, f"{name}{lacking}", _day(season.date), "")
-    return _Shown(*texts, about, board.ranks, season.entries, {})
+    return _SiteBoard(*texts, about, board.ranks, season.entries, {})
 
 
-def _of_reported(sections: Sequence[LeaderboardSection]) -> list[_Shown]:
+def _of_reported(sections: Sequence[LeaderboardSection]) -> list[_SiteBoard]:
     splits = Counter(section.ranks.board.split for section in sections)
-    shown = []
+    tables = []
     for section in sections:
         board = section.ranks.board
         apart = f" ({board.digest[:8]})" if splits[board.split] > 1 else ""
         name = f"Reported: {board.split}{apart}"
         texts = (section.name, name, name, _day(section.date), REPORTED)
-        shown.append(_Shown(*texts, None, section.ranks, section.entries, section.sources))
-    return shown
+        tables.append(_SiteBoard(*texts, None, section.ranks, section.entries, section.sources))
+    return tables
 
 
 def part_name(text: str) -> str:
@@ -209,8 +209,8 @@ def _metric(name: str) -> Json:
     return {"title": title, "meaning": info.summary, "kind": info.unit, "better": info.better}
 
 
-def _board(shown: _Shown, units: Units, parts: dict[str, Json]) -> Json:
-    board = shown.ranks.board
+def _board(table: _SiteBoard, units: Units, parts: dict[str, Json]) -> Json:
+    board = table.ranks.board
     present = {name for r in board.records for name in r.metrics}
     # Where every cell has failed, the page still shows the metrics without a level.
     usual = [name for name, info in METRICS.items() if info.cells != "unpaired"]
@@ -219,30 +219,30 @@ def _board(shown: _Shown, units: Units, parts: dict[str, Json]) -> Json:
     cells = [c for c in product(board.environments, board.anomalies) if c in have]
     filtered = selections(cells, {a: g for g, kinds in board.groups.items() for a in kinds})
     rows: list[Json] = []
-    for standing in shown.ranks.standings:
-        row, part = _row(shown, standing, len(rows), names, filtered, units)
+    for standing in table.ranks.standings:
+        row, part = _row(table, standing, len(rows), names, filtered, units)
         rows.append(row)
         parts[row["part"]] = part
     with_ends = _with_intervals(names, board)
-    metric_parts = {name: part_name(f"{shown.id}/{name}") for name in names}
+    metric_parts = {name: part_name(f"{table.id}/{name}") for name in names}
     of_rows = {row["part"]: parts[row["part"]] for row in rows}
     for i, (metric, name) in enumerate(metric_parts.items()):
-        place = with_ends.index(metric) if metric in with_ends else None
+        number = with_ends.index(metric) if metric in with_ends else None
         parts[name] = {
             "values": {part: content["values"][i] for part, content in of_rows.items()},
             "intervals": {
-                part: {key: ends[place] for key, ends in content["intervals"].items()}
+                part: {key: ends[number] for key, ends in content["intervals"].items()}
                 for part, content in of_rows.items()
-                if place is not None
+                if number is not None
             },
         }
     strengths: dict[str, set[str]] = {}
     for r in board.records:
         strengths.setdefault(f"{r.environment}|{r.anomaly}", set()).add(r.strength)
     return {
-        **_fields(shown, "id", "name", "title", "date", "notice", "season"),
-        "ranked": shown.season is not None,
-        "episodes": _episodes(shown.id, board, parts, rows),
+        **_fields(table, "id", "name", "title", "date", "notice", "season"),
+        "ranked": table.season is not None,
+        "episodes": _episodes(table.id, board, parts, rows),
         "cells": cells,
         "strengths": {cell: "".join(s) for cell, s in strengths.items() if len(s) == 1},
         "parts": metric_parts,
@@ -283,20 +283,20 @@ def _episodes(
 
 
 def _row(
-    shown: _Shown,
+    table: _SiteBoard,
     standing: Standing,
-    place: int,
+    position: int,
     names: Sequence[str],
     filtered: Mapping[str, Sequence[SelectedCell]],
     units: Units,
 ) -> tuple[Json, Json]:
     """Return a row's line of the index, and its part."""
-    row, records, board = standing.entry, standing.records, shown.ranks.board
-    source = shown.sources.get(row)
-    entry = shown.entries.get(row.detector) or Entry(row.detector)
+    row, records, board = standing.entry, standing.records, table.ranks.board
+    source = table.sources.get(row)
+    entry = table.entries.get(row.detector) or Entry(row.detector)
     cells = filtered[f"{ALL}|{ALL}"]
     intervals = _intervals(board, standing, names, filtered)
-    identity = f"{shown.id}/{row}"
+    identity = f"{table.id}/{row}"
     by_cell = _by_cell(standing, cells)
     line = {
         "id": identity,
@@ -307,12 +307,12 @@ def _row(
         "horizon": row.horizon,
         "overrides": row.overrides,
         "seeds": sorted({r.seed for r in records}),
-        "place": place,
+        "place": position,
         **_fields(standing, "rank", "equal", "band", "state", "variant", "trivial", "inputs"),
         **_fields(standing, "training", "origin", "authors", "paper", "year"),
         "url": entry.url,
-        "above": _difference(shown.ranks.above.get(row)),
-        "first": _difference(shown.ranks.first.get(row)),
+        "above": _difference(table.ranks.above.get(row)),
+        "first": _difference(table.ranks.first.get(row)),
         "worst": _worst(board, row),
         "seed_means": [_short(standing.seed_low), _short(standing.seed_high)],
         "cost": {n: _short(v) for n, v in standing.cost._asdict().items()},
@@ -335,12 +335,12 @@ def _row(
     return line, part
 
 
-def _difference(test: Difference | None) -> Json | None:
+def _difference(test: PairedDifference | None) -> Json | None:
     """Return how far a row is below another one, with its interval and verdict."""
     if test is None:
         return None
     numbers = {name: _short(getattr(test, name)) for name in ("difference", "low", "high", "p")}
-    return {"row": test.first, "told": test.told, **numbers}
+    return {"row": test.first, "told": test.told_apart, **numbers}
 
 
 def _worst(board: Board, row: Setting) -> Json | None:
