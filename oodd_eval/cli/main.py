@@ -86,7 +86,7 @@ COMMANDS: Final[Mapping[str, Commands]] = {
     "Look up": {
         "list": ("list what there is, one line each", "oodd_eval.cli.listing:list_names"),
         "info": ("describe a detector, environment, split, ...", "oodd_eval.cli.info:info"),
-        "leaderboard": ("show, submit and verify entries of the board", LEADERBOARD),
+        "leaderboard": ("show the board, enter it, run a season", LEADERBOARD),
     },
     "Add your own": {
         "new": ("write a ready plug-in project", "oodd_checks.commands.new:new"),
