@@ -2,7 +2,7 @@
 
 Each problem draws the terms of a metric for a number of test seeds per environment and asks whether
 its interval contains the true value. The table stands in docs/metrics.md. Exit code 1 where a mean
-on a board is covered in less than 93 %. 20 minutes.
+on a board is covered in less than 93 %. An hour.
 """
 
 from __future__ import annotations
@@ -204,7 +204,7 @@ class Calibrated:
         return list(rng.normal(0, 0.3, size=(n, 1)) + rng.normal(size=(n, self.rows)))
 
 
-BOARDS: Final = 200
+BOARDS: Final = 600
 """Problems of `OnBoard`, whose mean is also the true value."""
 
 LEAST: Final = 0.93
