@@ -40,11 +40,11 @@ from oodd_leaderboard.pages import documents
 
 from oodd_eval.cli.main import main as oodd_eval
 from oodd_eval.data.files import read_text
-from oodd_eval.metrics.catalogue import metric_info
 from oodd_eval.results.board import Board, boards
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.strengths import DETECTION, Strengths
+from oodd_eval.results.tables import Tables
 
 PAGES = (README, RESULTS)
 LOGS = ("skab", "alfa", "rosa", "tep", "nab", "uci", "ur3", "pi0-libero")
@@ -53,10 +53,18 @@ LOGS = ("skab", "alfa", "rosa", "tep", "nab", "uci", "ur3", "pi0-libero")
 HEADLINE = ("auc_matched", "found_within_20_at_5pct", "missed_at_5pct")
 
 
-def of_board(split: str, *metrics: str) -> Row:
-    """Return the row of a detector on a board."""
-    units = {m: 1 if metric_info(m).unit == "steps" else 100 for m in metrics}
-    return lambda name: cells(units[m] * float(ranking(split)[name][m]) for m in metrics)
+@functools.cache
+def five_columns(split: str) -> dict[str, list[str]]:
+    """Return the five columns of the rows reported on a split, as text, by detector."""
+    (board,) = (s.ranks.board for s in leaderboard().reported if s.ranks.board.split == split)
+    table = Tables(board).headline()
+    assert table
+    return {name: texts for name, *texts in table.rows}
+
+
+def of_board(split: str) -> Row:
+    """Return the five columns of a row on a board."""
+    return lambda name: " | ".join(five_columns(split)[name])
 
 
 def by_environment(name: str) -> str:
@@ -134,7 +142,7 @@ def of_protocols(name: str) -> str:
     """Return two metrics on two splits, each under protocol 2, from the archive, and today."""
     metrics = {"matched AUC": "auc_matched", "found within 20": "found_within_20_at_5pct"}
     return " | ".join(
-        f"{archived(split)[name][column].split()[0]} → {of_board(split, metric)(name)}"
+        f"{archived(split)[name][column].split()[0]} → {100 * float(ranking(split)[name][metric]):.1f}"
         for column, metric in metrics.items()
         for split in ("mini", "standard")
     )
@@ -204,12 +212,10 @@ def verdicts(text: str) -> str:
     return f"{by_text[text, 'paper']} | {by_text.get((text, 'fair'), '–')}"  # noqa: RUF001  an en dash
 
 
-WHOLE = ("auc_matched", "auc_unpaired", "auc_smoothed", *HEADLINE[1:], "false_episodes_at_5pct")
-
 TABLES: dict[str, Row] = {
-    "headline": of_board("mini", *HEADLINE, "delay_censored_at_5pct"),
-    "board mini": of_board("mini", *WHOLE),
-    "board standard": of_board("standard", *WHOLE),
+    "headline": of_board("mini"),
+    "board mini": of_board("mini"),
+    "board standard": of_board("standard"),
     "environments": by_environment,
     "papers": by_group,
     "horizons": at_horizons,

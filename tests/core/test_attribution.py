@@ -312,7 +312,7 @@ def test_a_failing_explanation_is_a_state_with_a_reason(tiny_split):
 def test_tables_have_a_section_for_detectors_that_explain(world, capsys):
     home, _ = world
     show = ["show", str(home / "results"), "--stored"]
-    assert main(show) == 0
+    assert main([*show, "--wide"]) == 0
     shown = capsys.readouterr().out
     section = shown[shown.index("Attribution at 5 %") :].split("\n\n")[0]
     assert "sensor named" in section
