@@ -58,8 +58,7 @@ def five_columns(split: str) -> dict[str, list[str]]:
     """Return the five columns of the rows reported on a split, as text, by detector."""
     (board,) = (s.ranks.board for s in leaderboard().reported if s.ranks.board.split == split)
     table = Tables(board).headline()
-    assert table
-    return {name: texts for name, *texts in table.rows}
+    return {name: texts for name, *texts in table.rows} if table else {}
 
 
 def of_board(split: str) -> Row:
@@ -138,11 +137,16 @@ def archived(split: str) -> dict[str, dict[str, str]]:
     return {r["detector"]: r for r in named if r["settings"].removesuffix(", 3 seeds") == "Δ=1"}
 
 
+def now(split: str, name: str, metric: str) -> float:
+    """Return a mean of today's board in per cent."""
+    return 100 * float(ranking(split)[name][metric])
+
+
 def of_protocols(name: str) -> str:
     """Return two metrics on two splits, each under protocol 2, from the archive, and today."""
     metrics = {"matched AUC": "auc_matched", "found within 20": "found_within_20_at_5pct"}
     return " | ".join(
-        f"{archived(split)[name][column].split()[0]} → {100 * float(ranking(split)[name][metric]):.1f}"
+        f"{archived(split)[name][column].split()[0]} → {now(split, name, metric):.1f}"
         for column, metric in metrics.items()
         for split in ("mini", "standard")
     )
