@@ -8,6 +8,7 @@ import sys
 import threading
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
@@ -373,6 +374,20 @@ class SharesOfTheWhole(Good):
         shares, onsets = super().explain(x)
         mean = np.nanmean(shares, axis=0) if len(x) > self.horizon else 1 / shares.shape[1]
         return np.where(np.isnan(shares), np.nan, mean), onsets
+
+
+@breaks("streaming", "two copies share what they remember of an episode: keep it in attributes")
+class Together(Good):
+    memory: ClassVar = []
+
+    def reset(self):
+        super().reset()
+        self.memory.clear()
+
+    def update(self, observation, action=None):
+        self.memory.append(observation)
+        score = super().update(observation, action)
+        return score + (len(self.memory) - len(self.seen))
 
 
 @breaks("streaming", "has only one of reset and update: expected both, or none")

@@ -31,6 +31,7 @@ from oodd_checks.conformance.trial import (
     trial,
 )
 from oodd_eval.data.trajectory import Trajectory
+from oodd_eval.errors import UsageError
 from oodd_eval.metrics.auc import auc
 from oodd_eval.names import counted
 from oodd_eval.plugins.contract import (
@@ -40,6 +41,7 @@ from oodd_eval.plugins.contract import (
     StorableDetector,
     StreamingDetector,
     check_scores,
+    copied,
     difference,
     takes_progress,
 )
@@ -295,13 +297,29 @@ def test_prefix(trial: Trial) -> None:
 
 
 def test_streaming(trial: Trial) -> None:
-    """Scores one observation at a time are those of the whole episode."""
+    """Scores one row at a time are those of the whole episode, of two copies in turns, too."""
     detector = offered(trial.fitted(), "reset", "update")
     # The second episode is left in the middle, so that the next one has to begin anew.
     first, second, third = trial.nominal(3)
     for trajectory in (first, second[: len(second) // 2], third):
         scores, failure = trial.scores(trajectory), "update differs from score of the whole episode"
         assert_equal(_streamed(detector, trajectory), scores, failure, tolerance=trial.tolerance)
+    try:
+        copies = copied(detector), copied(detector)
+    except UsageError:  # then episodes are streamed one after the other
+        return
+    streamed: list[list[float]] = [[], []]
+    with doing("update of two copies in turns"):
+        for stream in copies:
+            stream.reset()
+        for t in range(min(len(first), len(third))):
+            for stream, episode, row_scores in zip(copies, (first, third), streamed, strict=True):
+                action = episode.actions[t - 1] if t else None
+                row_scores.append(stream.update(episode.observations[t], action))
+    for episode, row_scores in zip((first, third), streamed, strict=True):
+        expected = trial.scores(episode)[: len(row_scores)]
+        failure = "two copies share what they remember of an episode: keep it in attributes"
+        assert_equal(np.array(row_scores, float), expected, failure, tolerance=trial.tolerance)
 
 
 def _streamed(detector: StreamingDetector, trajectory: Trajectory) -> Scores:
