@@ -1,6 +1,7 @@
 """The files of the leaderboard, rendered from records: a page of Markdown, tables, the site."""
 
 import contextlib
+import re
 import tomllib
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -237,7 +238,7 @@ def _board(
         f"## {escape(title)}\n",
         f"{facts}\n",
         *(f"**{escape(sentence)}**\n" for sentence in first_rows(ranks)),
-        *([markdown_table(front)] if front else []),
+        *([markdown_table(front, best_cells(front, ranks))] if front else []),
         *legend,
         markdown_body(body),
     ]
@@ -262,6 +263,23 @@ def first_rows(ranks: OrderedBoard) -> list[str]:
     if test.told_apart:
         return [f"{best.entry} is first in {phrase}: it beats {second.entry} by {amount}."]
     return [f"{', '.join(band)} share the first rank in {phrase}: no difference is shown."]
+
+
+LOWER: Final = ("missed", "false episodes")
+"""Front columns in which less is better."""
+
+
+def best_cells(front: Table, ranks: OrderedBoard) -> set[tuple[int, int]]:
+    """Return row and column of the best figures of ranked rows, of which trivial ones have none."""
+    ranked = [i for i, row in enumerate(ranks.standings) if row.rank and not row.trivial]
+    best: set[tuple[int, int]] = set()
+    for j, title in list(enumerate(front.header))[front.labels :]:
+        printed = {i: re.search(r"-?\d+\.\d+", front.rows[i][j]) for i in ranked}
+        figures = {i: float(match[0]) for i, match in printed.items() if match}
+        if figures:
+            first = (min if title in LOWER else max)(figures.values())
+            best |= {(i, j) for i, figure in figures.items() if figure == first}
+    return best
 
 
 def _authors(ranks: OrderedBoard, entries: Mapping[str, Entry]) -> Table:

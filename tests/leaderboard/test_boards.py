@@ -59,6 +59,14 @@ def test_a_page_says_who_is_first_when_and_by_whom(season, reported):
     assert "](javascript:" not in text
 
 
+def test_bold_are_the_best_of_ranked_rows_but_for_trivial_ones():
+    # The row clock misses fewest episodes here.
+    text = page(Leaderboard([helpers_site.season(rows=("rf", "clock"))]))
+    of_row = {name: re.search(rf"\| \d .*\| {name} .*", text)[0] for name in ("rf", "clock")}
+    assert "**" not in of_row["clock"]
+    assert of_row["rf"].count("**") == 2 * 5
+
+
 def test_places_say_what_is_told_apart(season):
     read = csv.DictReader(io.StringIO(standings_csv(season.ranks)))
     lines = {row["detector"]: row for row in read}

@@ -1,6 +1,7 @@
 """Reports as text with markup, for people: Markdown, HTML and LaTeX."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
 from html import escape as escape_html
 from typing import Final
 
@@ -54,10 +55,15 @@ def markdown_list(lines: Sequence[str]) -> list[str]:
     return [f"- {escape(line)}" for line in lines]
 
 
-def markdown_table(table: Table) -> str:
-    """Return a table as Markdown under its title, its note below it."""
+def markdown_table(table: Table, bold: Collection[tuple[int, int]] = ()) -> str:
+    """Return a table as Markdown under its title, its note below it; `bold` are row and column."""
     note = f"\n{escape(table.note)}\n" if table.note else ""
-    return f"### {escape(table.title)}\n\n{grid(table, 'pipe', escape)}\n{note}"
+    rows = [
+        [f"**{escape(text)}**" if (i, j) in bold else escape(text) for j, text in enumerate(row)]
+        for i, row in enumerate(table.rows)
+    ]
+    escaped = replace(table, header=[*map(escape, table.header)], rows=rows)
+    return f"### {escape(table.title)}\n\n{grid(escaped, 'pipe')}\n{note}"
 
 
 def escape(text: str) -> str:

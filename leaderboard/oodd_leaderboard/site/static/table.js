@@ -264,12 +264,15 @@ const selectsAll = (board) => cellsOf(board, state).length === board.cells.lengt
 /** The elements of the table's lines, by row. */
 function linesOf(board, rows, columns, inOrder) {
   const found = new Map(board.rows.map((row) => [row, columns.map((column) => column.of(row, state))]));
-  const best = columns.map((column, i) => bestOf(column, board.rows.filter((row) => isNumber(row.rank)).map((row) => found.get(row)[i].value)));
+  const best = columns.map((column, i) => bestOf(column, board.rows.filter(mayBeBest).map((row) => found.get(row)[i].value)));
   const lows = board.rows.map((row) => mean(board, row, board.ranking, state)).map(({ low, value }) => low ?? value);
   const start = Math.min(0.4, Math.floor(10 * Math.min(...lows.filter(isNumber))) / 10);
   const last = inOrder && board.rows.findLast((row) => row.band);
   return new Map(rows.map((row) => [row, tableRow(board, row, columns, found.get(row), { best, start, inOrder, last: row === last })]));
 }
+
+/** Whether a row can be marked as the best: it is ranked, and knows something of the dynamics. */
+const mayBeBest = (row) => isNumber(row.rank) && !row.trivial;
 
 /** The value that a column marks; null where it marks none. */
 function bestOf(column, values) {
@@ -298,7 +301,7 @@ function tableRow(board, row, columns, values, { best, start, inOrder, last }) {
     columns.map((column, i) => {
       const found = values[i];
       const text = column.text ? column.text(found) : meanText(found, column.kind);
-      const strong = isNumber(row.rank) && best[i] !== null && show(found.value, column.kind) === show(best[i], column.kind);
+      const strong = mayBeBest(row) && best[i] !== null && show(found.value, column.kind) === show(best[i], column.kind);
       const under = column.under ? column.under(found) : column.interval && isNumber(found.low) && intervalOf(found, column.kind).trim();
       return element("td", { class: found.state ? "state" : column.whisker ? "wide" : null, title: found.reason || null, "data-csv": text },
         column.whisker && whisker(found, start), element(strong ? "strong" : "span", { class: "value" }, text), under && element("span", { class: "interval" }, under));
