@@ -48,6 +48,7 @@ from oodd_leaderboard.standings import OrderedBoard
 PAGE: Final = "README.md"
 SITE: Final = "site"
 CELLS: Final = f"{SITE}/cells.csv.gz"
+PARTS: Final = f"{SITE}/{site.PARTS}/"
 STALE: Final = "no part of the leaderboard any more"
 
 TEXTS: Final = tomllib.loads(Path(__file__).with_name("page.toml").read_text(encoding="utf-8"))
@@ -82,26 +83,31 @@ def read_leaderboard(directory: Path) -> Leaderboard:
 
 
 def build(
-    leaderboard: Leaderboard, output: Path, *, on_part: Callable[[str], object] = str
+    leaderboard: Leaderboard,
+    output: Path,
+    *,
+    at: Path | None = None,
+    on_part: Callable[[str], object] = str,
 ) -> list[str]:
     """Write page, tables, site and the published file, the same for the same records.
 
-    Returns their names, the page first. A compressed file with the same content stays as it is,
-    whatever has compressed it. `on_part` is called with the name of each part before it is made.
+    Returns their names, the page first. Links are those of files `at` a place, by default there. A
+    compressed file with the same content stays as it is, whatever has compressed it. `on_part` is
+    called with the name of each part before it is made.
     """
     on_part("page and tables")
-    files = documents(leaderboard)
+    files = documents(leaderboard, site.project(at or output))
     files[CELLS] = cells(leaderboard)
     on_part("site")
     boards = leaderboard.reported, leaderboard.suites, leaderboard.seasons
-    parts = site.files(*boards, links=site.links(output))
+    parts = site.files(*boards, links=site.links(at or output))
     files |= {f"{SITE}/{name}": content for name, content in parts.items()}
     for name, content in files.items():
         if isinstance(content, str):
             write_text(output / name, content)
         elif not _has_content(output / name, content):
             write_bytes(output / name, content)
-    for old in set((output / SITE / site.PARTS).glob("*.js")) - {output / name for name in files}:
+    for old in set((output / PARTS).glob("*.js")) - {output / name for name in files}:
         old.unlink()
     return list(files)
 
@@ -111,9 +117,9 @@ def build_season(directory: Path) -> list[str]:
     return build(read_leaderboard(directory), directory)
 
 
-def documents(leaderboard: Leaderboard) -> dict[str, str | bytes]:
+def documents(leaderboard: Leaderboard, project: str = "../") -> dict[str, str | bytes]:
     """Return what is committed beside the records by name: page, tables, the published file."""
-    files: dict[str, str | bytes] = {PAGE: page(leaderboard)}
+    files: dict[str, str | bytes] = {PAGE: page(leaderboard, project)}
     for section in leaderboard.boards:
         files[_csv(section)] = standings_csv(section.ranks)
     if not leaderboard.alone:
@@ -180,8 +186,11 @@ def _has_content(path: Path, compressed: bytes) -> bool:
     return False
 
 
-def page(leaderboard: Leaderboard) -> str:
-    """Return the whole page: seasons first, then reported rows and further suites."""
+def page(leaderboard: Leaderboard, project: str = "../") -> str:
+    """Return the whole page: seasons first, then reported rows and further suites.
+
+    `project` is what addresses of documents begin with; without it they are no links.
+    """
     parts = [TEXTS["introduction"].format(site=f"{SITE}/{site.PAGE}")]
     if not leaderboard.seasons:
         parts.append(TEXTS["no-season"])
@@ -190,14 +199,14 @@ def page(leaderboard: Leaderboard) -> str:
         parts.append(TEXTS["reported"].format(sentence=REPORTED))
     parts += map(_reported, leaderboard.reported)
     parts += map(_suite, leaderboard.suites)
-    return "\n".join([*parts, TEXTS["taking-part"]])
+    text = "\n".join([*parts, TEXTS["taking-part"]])
+    link = rf"[\1]({project}\2)" if project else r"\1"
+    return re.sub(r"\[(docs/[^]]*)\]\(\.\./(docs/[^)]*)\)", link, text)
 
 
 def _season(board: SeasonBoard) -> str:
     season, ranks = board.season, board.ranks
-    title = f"Season {season.name}, {season.date}" if season.date else f"Season {season.name}"
-    if season.trial:
-        title += f": a trial and no board, it lacks {' and '.join(board.lacks)}"
+    title = ", ".join(filter(None, [board.title, season.date])) + ": no board" * season.trial
     seeds = ", ".join(map(str, season.seeds))
     facts = TEXTS["season"].format(
         bits=season.bits,
@@ -208,6 +217,7 @@ def _season(board: SeasonBoard) -> str:
         environments=", ".join(season.environments),
         table=_csv(board),
     )
+    facts = "\n".join(filter(None, [board.notice, facts]))
     return _board(title, facts, ranks, season.entries, [TEXTS["legend"]])
 
 
@@ -257,12 +267,17 @@ def first_rows(ranks: OrderedBoard) -> list[str]:
     if len(places) < 2:
         return []
     best, second = places[:2]
-    test, phrase = ranks.first[second.entry], metric_info(ranks.board.ranking).phrase
-    band = [str(row.entry) for row in places if row.band]
-    amount = difference_text(test, ranks.board.ranking)
-    if test.told_apart:
-        return [f"{best.entry} is first in {phrase}: it beats {second.entry} by {amount}."]
-    return [f"{', '.join(band)} share the first rank in {phrase}: no difference is shown."]
+    test, board = ranks.first[second.entry], ranks.board
+    cells = board.environments, board.anomalies
+    mean = board.mean(best.entry, *cells, board.ranking, intervals=True)
+    by = f" by {best.authors}" * bool(best.authors) + f" ({best.year})" * bool(best.year)
+    noun, told = metric_info(board.ranking).noun, "told" if test.told_apart else "not told"
+    text = f"Best: {best.entry}{by}, {noun} {tables.show_value(mean, board.ranking)}. It is {told} "
+    text += f"from the second, {second.entry}: the difference is "
+    lines = [f"{text}{difference_text(test, board.ranking)}."]
+    if (band := sum(row.band for row in places)) > 2:
+        lines.append(f"The first band has {band} rows: none of them is told from the first.")
+    return lines
 
 
 LOWER: Final = ("missed", "false episodes")

@@ -25,6 +25,16 @@ class SeasonBoard:
         """Name in file names."""
         return f"season-{self.season.name}"
 
+    @property
+    def title(self) -> str:
+        """Name in headings."""
+        return f"{'Trial' if self.season.trial else 'Season'} {self.season.name}"
+
+    @property
+    def notice(self) -> str:
+        """What a trial lacks, as a sentence; empty for a season."""
+        return f"This trial lacks {' and '.join(self.lacks)}." if self.lacks else ""
+
 
 def read_season_board(directory: Path) -> SeasonBoard:
     """Read a season and order its rows.

@@ -45,7 +45,8 @@ def test_a_page_says_who_is_first_when_and_by_whom(season, reported):
     assert "No season" not in head
     board, _, below = rest.partition("## Reported rows")
     assert f"Bits {season.season.bits}, split digest {season.season.split.digest}" in board
-    assert "riqn is first in matched AUC: it beats mine by" in board
+    assert "Best: riqn by Danesh, Fern (2021), matched AUC" in board
+    assert "It is told from the second, mine: the difference is" in board
     assert "others, 2026" in board
     assert "Benchmarks \\<b\\>" in board
     assert "not done after 5 s" in board
@@ -57,6 +58,9 @@ def test_a_page_says_who_is_first_when_and_by_whom(season, reported):
     assert "## Reported on mini, protocol 1" in below
     assert "| rank" not in below
     assert "](javascript:" not in text
+    assert "[docs/submitting.md](../docs/submitting.md)" in head
+    assert "docs/leaderboard.md)" not in page(Leaderboard([season]), "")
+    assert "(../../../docs/leaderboard.md)" in page(Leaderboard([season]), "../../../")
 
 
 def test_bold_are_the_best_of_ranked_rows_but_for_trivial_ones():
@@ -83,12 +87,13 @@ def test_rows_that_are_not_told_apart_share_the_first_rank():
     close = helpers_site.season(rows=("rf", "mine", "clock"))
     assert [row.rank for row in close.ranks.standings] == [1, 1, 3]
     (sentence,) = first_rows(close.ranks)
-    assert sentence.endswith("share the first rank in matched AUC: no difference is shown.")
+    assert re.search(r"It is not told from the second, \w+: the difference is .*\]\.$", sentence)
 
 
 def test_build_writes_a_season_and_refuses_an_incomplete_one(leaderboard, season, capsys):
     assert main(["leaderboard", "build", str(leaderboard)]) == 0
     assert (leaderboard / "site" / "index.html").is_file()
+    assert "site/data" not in capsys.readouterr().out
     assert main(["leaderboard", "build", str(leaderboard), "--check"]) == 0
     (leaderboard / "README.md").write_text("")
     assert main(["leaderboard", "build", str(leaderboard), "--check"]) == 1
@@ -106,7 +111,7 @@ def test_a_trial_is_built_where_it_lies_and_says_that_it_is_none(tmp_path):
     directory = write(tmp_path / "trial", trial)
     assert main(["leaderboard", "build", str(directory), "-q"]) == 0
     text = (directory / "README.md").read_text()
-    assert re.search(r"## Season .* no board, it lacks environments acrobot.*tank", text)
+    assert "## Trial 2026-11, 2026-11-27: no board\n\nThis trial lacks environments acrobot" in text
     assert not (directory / PUBLISHED).exists()
     assert read_published_of(tmp_path, [trial]) == []
 
@@ -151,7 +156,7 @@ def test_an_installation_without_a_board_says_so(tmp_path, monkeypatch, capsys):
 def test_show_prints_the_last_season_or_a_table_of_reported_rows(shipped, capsys):
     assert main(["leaderboard", "show"]) == 0
     text = " ".join(capsys.readouterr().out.split())
-    assert text.startswith("Season 2026-11, 2026-11-27 riqn is first")
+    assert text.startswith("Season 2026-11, 2026-11-27 Best: riqn by Danesh")
     assert "the paper, 2021" in text
     assert "Reported" not in text
     assert main(["leaderboard", "show", "--split", "mini", "--csv"]) == 0

@@ -79,7 +79,9 @@ def test_every_page_leads_home_to_the_board_to_submitting_and_to_the_source(page
 
 
 def test_links_lead_to_the_checkout_that_a_site_is_in(tmp_path, monkeypatch):
-    assert site.links(tmp_path / "my-board") == {}
+    monkeypatch.setattr(site, "__file__", str(tmp_path / "site-packages" / "site.py"))
+    beside = site.links(tmp_path / "my-board")
+    assert beside == {"home": "../README.md", "submit": "../README.md#how-to-take-part"}
     (tmp_path / "docs").mkdir()
     (tmp_path / "docs" / "submitting.md").touch()
     assert site.links(tmp_path / "leaderboard") == LINKS
@@ -96,7 +98,8 @@ def test_the_head_says_which_season_it_is_and_of_what_day(page, reported):
     files = site.files((), (), [trial])
     assert "A trial season: no board." in files[site.PAGE]
     (board,) = embedded(files[site.PAGE])["boards"]
-    assert board["title"] == "Trial small: no board, since it lacks environments ant, arm"
+    assert board["title"] == "Trial small: no board"
+    assert board["notice"] == "This trial lacks environments ant, arm."
 
 
 def test_the_newest_season_is_first_then_trials_then_reported_tables(reported, season):
@@ -107,7 +110,9 @@ def test_the_newest_season_is_first_then_trials_then_reported_tables(reported, s
         "Season 2026-11", "Season 2026-05", "Trial small",
         "Reported: mini (abababab)", "Reported: mini (cdcdcdcd)",
     ]  # fmt: skip
-    assert [board["notice"] for board in data["boards"]] == ["", "", "", REPORTED, REPORTED]
+    assert [board["notice"] for board in data["boards"]] == [
+        "", "", "This trial lacks environments ant, arm.", REPORTED, REPORTED,
+    ]  # fmt: skip
 
 
 def test_markup_and_placeholders_in_names_stay_text(tmp_path):

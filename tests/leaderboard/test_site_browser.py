@@ -177,8 +177,8 @@ def test_a_reported_table_has_no_ranks_and_says_what_it_is(browser):
 def test_a_trial_says_in_its_title_that_it_is_no_board(window, tmp_path):
     trial = helpers_site.season(name="small", trial=True)
     window.open(written(tmp_path, (), (), [trial]))
-    title = "Trial small: no board, since it lacks environments ant, arm"
-    assert window.text("#head h1") == title
+    assert window.text("#head h1") == "Trial small: no board"
+    assert window.text("#head .notice") == "This trial lacks environments ant, arm."
 
 
 # -- the table ------------------------------------------------------------------------------------

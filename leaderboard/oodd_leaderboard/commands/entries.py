@@ -11,7 +11,7 @@ from oodd_eval.cli.console import make_console
 from oodd_eval.data.files import only_writer, temporary_directory
 from oodd_leaderboard import submit as submission
 from oodd_leaderboard.entry import ENTRY
-from oodd_leaderboard.pages import STALE, differences, read_leaderboard, stale
+from oodd_leaderboard.pages import PARTS, STALE, differences, read_leaderboard, stale
 from oodd_leaderboard.pages import build as build_board
 
 LEADERBOARD: Final = "leaderboard"  # its directory, from the root of a checkout
@@ -38,11 +38,11 @@ def build(options: Options) -> int:
             return say(f"no season and no reported rows in {options.directory}", 5)
         target = fresh if options.check else output
         with only_writer(target):
-            written = build_board(leaderboard, target, on_part=show)
+            written = build_board(leaderboard, target, at=output, on_part=show)
         lines = differences(target, output) if options.check else []
     if not options.check:
         if options.verbosity >= 0:
-            print("\n".join(str(output / name) for name in written))
+            print("\n".join(str(output / name) for name in written if PARTS not in name))
         for name in stale(output, written):
             say(f"{output / name} is {STALE}: delete it", 0)
         return 0

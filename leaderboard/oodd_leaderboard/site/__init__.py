@@ -9,6 +9,7 @@ calls one function with its name and its content as JSON text. What they hold is
 import base64
 import hashlib
 import json
+import os
 import re
 from collections.abc import Mapping, Sequence
 from html import escape
@@ -44,25 +45,32 @@ LINKS: Final = {
 }
 """Titles of the links that every page has beside the board, and where they lead in a checkout."""
 
+_WITHOUT: Final = {"home": "../README.md", "submit": "../README.md#how-to-take-part"}
+"""Links of a site that knows neither repository nor checkout: the page beside it."""
+
 _STATIC = Path(__file__).with_name("static")
 
 
-def links(leaderboard: Path) -> dict[str, str]:
-    """Return where the links of a site lead, by name: the repository, or the checkout it is in.
+def project(directory: Path) -> str:
+    """Return where the project's files are as seen from a directory, with a slash at the end.
 
-    A site in neither has none. `leaderboard` is the directory that the site's is in.
+    They are in the repository, in the checkout that the directory is in, or in that of this module;
+    empty where there is none of them.
     """
-    if project := repository():
-        return {
-            name: project if name != "submit" else f"{project}/blob/main/{path}"
-            for name, (_, path) in LINKS.items()
-        }
-    here = leaderboard.absolute()
-    checkouts = (p for p in here.parents if (p / LINKS["submit"][1]).is_file())
-    if not (checkout := next(checkouts, None)):
-        return {}
-    up = "../" * (len(here.relative_to(checkout).parts) + 1)
-    return {name: up + path for name, (_, path) in LINKS.items()}
+    if address := repository():
+        return f"{address}/blob/main/"
+    here = directory.absolute()
+    places = (*here.parents, *Path(__file__).parents)
+    checkout = next((p for p in places if (p / LINKS["submit"][1]).is_file()), None)
+    return os.path.relpath(checkout, here) + "/" if checkout else ""
+
+
+def links(leaderboard: Path) -> dict[str, str]:
+    """Return where the links of a site lead, by name; `leaderboard` is what its directory is in."""
+    if not (base := project(leaderboard / "site")):
+        return _WITHOUT
+    found = {name: base + path for name, (_, path) in LINKS.items()}
+    return found | (dict.fromkeys(("home", "source"), address) if (address := repository()) else {})
 
 
 def files(

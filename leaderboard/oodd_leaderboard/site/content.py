@@ -142,15 +142,14 @@ def _day(iso: str) -> str:
 
 def _of_season(board: SeasonBoard) -> _SiteBoard:
     season = board.season
-    name = f"{'Trial' if season.trial else 'Season'} {season.name}"
-    lacking = f": no board, since it lacks {', '.join(board.lacks)}" if season.trial else ""
     about = _fields(season, "bits", "seeds", "oodd_eval") | {
         "installed": {
             entry: [_fields(wheel, "distribution", "version", "sha256") for wheel in wheels]
             for entry, wheels in season.installed.items()
         }
     }
-    texts = (board.name, name, f"{name}{lacking}", _day(season.date), "")
+    title = board.title + ": no board" * season.trial
+    texts = (board.name, board.title, title, _day(season.date), board.notice)
     return _SiteBoard(*texts, about, board.ranks, season.entries, {})
 
 
