@@ -17,6 +17,7 @@ An entry with neither requirement nor wheel is a row that oodd-eval ships. Readi
 nothing of theirs.
 """
 
+import dataclasses
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -27,11 +28,13 @@ from typing import Any, ClassVar, Final, Literal
 from pydantic import TypeAdapter, ValidationError
 
 from oodd_eval.data.bounded import read_toml
-from oodd_eval.errors import ResultsError
+from oodd_eval.errors import ResultsError, UnknownNameError
+from oodd_eval.names import check_known
 from oodd_eval.plugins.contract import Training
 from oodd_leaderboard import formats
 
 ENTRY: Final = "entry.toml"
+FORMS: Final = f"NAME.toml or NAME/{ENTRY} for each row"
 
 Origin = Literal["paper", "others", "project", "trivial", "oracle"]
 """Whose a row is: the paper's, other authors', this project's, a trivial one, an oracle."""
@@ -106,6 +109,10 @@ def read_entry(path: Path) -> Entry:
     if "name" in content:
         raise ResultsError(f"{path}: name is the file's, expected no field of that name")
     try:
+        check_known("field of entries", [f.name for f in dataclasses.fields(Entry)[1:]], *content)
+    except UnknownNameError as error:
+        raise ResultsError(f"{path}: {error}") from None
+    try:
         fields = json.dumps({"name": name, "detector": name, **content}, default=str)
         entry = TypeAdapter(Entry).validate_json(fields)
     except ValidationError as error:
@@ -149,7 +156,7 @@ def read_entries(directory: Path) -> list[Entry]:
     `ResultsError`: there is none, two have one name, or one distribution has two ranked rows.
     """
     if not directory.is_dir():
-        raise ResultsError(f"no directory of entries at {str(directory)!r}")
+        raise ResultsError(f"no directory {str(directory)!r}: expected one with {FORMS}")
     files = sorted((*directory.glob("*.toml"), *directory.glob(f"*/{ENTRY}")))
     entries = sorted(map(read_entry, files), key=lambda entry: entry.name)
     _check_apart(entries)

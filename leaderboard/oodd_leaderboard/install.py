@@ -114,21 +114,26 @@ def _requirement(entry: Entry, directory: Path, work: Path) -> str:
         return entry.requirement
     if Path(entry.wheel).name != entry.wheel or not entry.wheel.endswith(".whl"):
         raise InstallError(f"wheel is {entry.wheel!r:.80}, expected a file NAME.whl")
-    if (directory / entry.name / ENTRY).is_file():
-        directory /= entry.name
-    content, copy = (
-        read_bytes(directory / entry.wheel, MOST_WHEEL_BYTES, InstallError),
-        work / entry.wheel,
-    )
+    path, copy = beside(entry, directory) / entry.wheel, work / entry.wheel
+    content = read_bytes(path, MOST_WHEEL_BYTES, InstallError)
     _check_digest(entry, hashlib.sha256(content).hexdigest())
     copy.write_bytes(content)
     _check_content([copy])
     return f"{copy.as_uri()}#sha256={entry.sha256}"
 
 
+def beside(entry: Entry, directory: Path) -> Path:
+    """Return the directory that an entry's file is in: that of the entries, or one in it."""
+    own = directory / entry.name
+    return own if (own / ENTRY).is_file() else directory
+
+
 def _check_digest(entry: Entry, digest: str) -> None:
     if digest != entry.sha256:
-        raise InstallError(f"sha256 of the wheel is {digest}, the entry has {entry.sha256 or None}")
+        raise InstallError(
+            f"sha256 of the wheel is {digest}, the entry has {entry.sha256 or None}: write the "
+            "digest of this wheel into the entry, or bring the wheel that has the entry's"
+        )
 
 
 def _check_content(wheels: Iterable[Path]) -> None:

@@ -18,7 +18,7 @@ from oodd_eval._version import __version__
 from oodd_eval.data.facts import PROTOCOL, SplitDefinition
 from oodd_eval.data.split import Split, load_split, split_places
 from oodd_eval.errors import MissingExtraError, PluginError, UnknownNameError, UsageError
-from oodd_eval.plugins.discovery import Offer, Plugins, printable
+from oodd_eval.plugins.discovery import Plugins, printable
 from oodd_eval.plugins.installed import normalized
 from oodd_eval.plugins.parameters import resolve_parameters
 from oodd_eval.results.directory import ResultsDirectory
@@ -28,7 +28,7 @@ from oodd_eval.scoring.executors import RunSettings
 from oodd_eval.scoring.plan import Plan, Unit, make_plan
 from oodd_eval.scoring.runner import run
 from oodd_leaderboard.entry import Entry
-from oodd_leaderboard.install import install
+from oodd_leaderboard.install import beside, install
 from oodd_leaderboard.sandbox.describe import discover_entry
 from oodd_leaderboard.sandbox.launcher import make_sandbox
 from oodd_leaderboard.season_files import (
@@ -156,15 +156,24 @@ def check_entries(entries: Sequence[Entry], directory: Path, plugins: Plugins) -
     shipped ones that do not exist.
     """
     for entry in entries:
-        wheels = (directory / entry.name / entry.wheel, directory / entry.wheel)
-        if entry.wheel and not any(path.is_file() for path in wheels):
-            raise UsageError(f"entry {entry.name!r} names the wheel {entry.wheel}: no such file")
+        if entry.wheel and not (path := beside(entry, directory) / entry.wheel).is_file():
+            raise UsageError(
+                f"entry {entry.name!r} has the wheel {entry.wheel}, expected it beside the entry: "
+                f"no such file as {str(path)!r}"
+            )
         if entry.shipped:
             with suppress(PluginError, MissingExtraError):  # a reason of the row
-                _check_shipped(entry, plugins.offer(entry.detector))
+                _check_shipped(entry, plugins)
 
 
-def _check_shipped(entry: Entry, offer: Offer) -> None:
+def _check_shipped(entry: Entry, plugins: Plugins) -> None:
+    try:
+        offer = plugins.offer(entry.detector)
+    except UnknownNameError as error:
+        raise UsageError(
+            f"entry {entry.name!r}: {error}; a row that oodd-eval does not ship needs wheel or "
+            "requirement"
+        ) from None
     if offer.distribution != entry.distribution:
         raise UsageError(
             f"entry {entry.name!r} names the detector {entry.detector!r} of {offer.distribution}, "

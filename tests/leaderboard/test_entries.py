@@ -43,7 +43,7 @@ GOOD = 'requirement = "oodd-mine==1.2"\nsha256 = "{}"\nauthors = "A. Author"\n'
         ('wheel = "../x.whl"', "wheel"),
         ('detector = "../x"', "detector"),
         ('year = "2026"', "year"),
-        ('grant = "trusted"', "grant"),
+        ('grant = "trusted"', "unknown field of entries 'grant'"),
         ('name = "other"', "name"),
         ('origin = "ours"', "origin"),
         ('[parameters]\n"<b>" = 1', "parameters"),

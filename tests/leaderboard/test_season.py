@@ -176,10 +176,11 @@ def test_a_changed_row_is_run_again_before_a_season_is_whole(whole, entries, tmp
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ('detector = "mewmo"\n', "mewmo"),
+        ('detector = "mewmo"\n', "entry 'mewma': unknown detector 'mewmo'"),
+        ('author = "Lovelace"\n', "unknown field of entries 'author': did you mean 'authors'?"),
         ("parameters = {klip = 2.0}\n", "klip"),
         ('parameters = {clip = "no"}\n', "clip"),
-        ('wheel = "mine-1-py3-none-any.whl"\nsha256 = "' + "0" * 64 + '"\n', "no such file"),
+        ('wheel = "mine-1-py3-none-any.whl"\nsha256 = "' + "0" * 64 + '"\n', "no such file as"),
     ],
 )
 def test_errors_of_entries_are_told_before_anything_starts(tmp_path, content, message, capsys):

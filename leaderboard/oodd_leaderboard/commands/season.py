@@ -35,8 +35,8 @@ from oodd_eval.results.record import Record
 from oodd_eval.scoring.display import Display
 from oodd_eval.scoring.executors import RunSettings, check_executor
 from oodd_leaderboard import season as running
-from oodd_leaderboard.entry import read_entries
-from oodd_leaderboard.pages import build_season
+from oodd_leaderboard.entry import FORMS, read_entries
+from oodd_leaderboard.pages import PAGE, SITE, build_season
 from oodd_leaderboard.sandbox.launcher import make_sandbox
 from oodd_leaderboard.season_files import SEASON, SPLIT, read_season, row_path
 
@@ -87,7 +87,7 @@ def season(options: Options) -> int:
     entries = []
     if options.entries:
         if not (entries := read_entries(options.entries)):
-            return say(f"no entries in {options.entries}", 5)
+            return say(f"no entries in {options.entries}: expected {FORMS} there", 5)
         running.check_entries(entries, options.entries, plugins)
         check_executor(options.executor)
         make_sandbox()  # what is missing for it is said before anything is recorded
@@ -147,7 +147,8 @@ def _run(runner: running.SeasonRunner, console: Console, *, quiet: bool) -> int:
     runner.season = running.end(runner.season, runner.directory)
     with console.status("page and site") if console.is_terminal else nullcontext():
         build_season(runner.directory)
-    console.print(f"season {runner.season.name} is whole: {runner.directory}")
+    page, site = runner.directory / PAGE, runner.directory / SITE / "index.html"
+    console.print(f"season {runner.season.name} is whole: page {page}, site {site}")
     return int(not all(record.ok for record in records))
 
 

@@ -207,7 +207,9 @@ def _masked(path: str, *, directory: bool) -> tuple[str, ...]:
 
 def _program() -> str:
     if not (program := shutil.which("bwrap")):
-        raise UsageError("a sandbox needs bubblewrap, the program bwrap (on Linux): install it")
+        raise UsageError(
+            "a sandbox needs bubblewrap, the program bwrap (on Linux): PATH has none, install it"
+        )
     return program
 
 
