@@ -274,7 +274,7 @@ def first_rows(ranks: OrderedBoard) -> list[str]:
     noun, told = metric_info(board.ranking).noun, "told" if test.told_apart else "not told"
     text = f"Best: {best.entry}{by}, {noun} {tables.show_value(mean, board.ranking)}. It is {told} "
     text += f"from the second, {second.entry}: the difference is "
-    lines = [f"{text}{difference_text(test, board.ranking)}."]
+    lines = [f"{text}{difference_text(test)}."]
     if (band := sum(row.band for row in places)) > 2:
         lines.append(f"The first band has {band} rows: none of them is told from the first.")
     return lines

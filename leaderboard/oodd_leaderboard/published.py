@@ -7,6 +7,7 @@ are records.
 
 import json
 import lzma
+import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -16,7 +17,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from oodd_eval.data.files import read_text
 from oodd_eval.errors import ResultsError, UsageError
-from oodd_eval.metrics.catalogue import FOUND_WITHIN, UNDEFINED, metric_info
+from oodd_eval.metrics.catalogue import FOUND_WITHIN, UNDEFINED
 from oodd_eval.metrics.ranking import PairedDifference, Position
 from oodd_eval.prose import Table
 from oodd_eval.results.board import Conditions, boards, expected_cells, grouped, level_of, ranked_by
@@ -261,9 +262,15 @@ def _whose(row: Standing) -> str:
     return ", ".join(filter(None, [ORIGINS[row.origin], year]))
 
 
-def difference_text(test: PairedDifference, metric: str) -> str:
-    """Return a difference with its interval in the metric's unit; an end may be missing."""
-    info = metric_info(metric)
-    unit = {"percent": " points", "steps": " steps"}.get(info.unit, "")
-    value, low, high = map(info.text, (test.difference, test.low, test.high))
-    return f"{value}{unit} [{low}, {high}]"
+def difference_text(test: PairedDifference) -> str:
+    """Return a difference in points with its interval, of as many digits as tell it from 0."""
+    ends = [100 * end for end in (test.low, test.high) if not math.isnan(end)]
+    if not ends:
+        return f"{100 * test.difference:z.1f} points (no interval: too few test episodes)"
+    seen = all if test.told_apart else any
+    digits = next((n for n in (1, 2, 3) if seen(round(end, n) for end in ends)), 4)
+    value, low, high = (
+        UNDEFINED if math.isnan(end) else f"{100 * end:z.{digits}f}"
+        for end in (test.difference, test.low, test.high)
+    )
+    return f"{value} points [{low}, {high}]"

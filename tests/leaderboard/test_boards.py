@@ -2,6 +2,7 @@
 
 import csv
 import io
+import math
 import re
 from dataclasses import replace
 
@@ -18,6 +19,7 @@ from oodd_eval.cli.main import main
 from oodd_eval.data.files import decompress
 from oodd_eval.errors import ResultsError
 from oodd_eval.metrics import catalogue
+from oodd_eval.metrics.ranking import PairedDifference
 from oodd_eval.results.directory import ResultsDirectory
 
 
@@ -88,6 +90,13 @@ def test_rows_that_are_not_told_apart_share_the_first_rank():
     assert [row.rank for row in close.ranks.standings] == [1, 1, 3]
     (sentence,) = first_rows(close.ranks)
     assert re.search(r"It is not told from the second, \w+: the difference is .*\]\.$", sentence)
+
+
+def test_a_difference_has_digits_that_tell_it_from_nothing():
+    test = PairedDifference("a", "b", 0.0011, 0.0002, 0.002, 0.01)
+    assert published.difference_text(test) == "0.11 points [0.02, 0.20]"
+    test = replace(test, low=math.nan, high=math.nan)
+    assert published.difference_text(test) == "0.1 points (no interval: too few test episodes)"
 
 
 def test_build_writes_a_season_and_refuses_an_incomplete_one(leaderboard, season, capsys):

@@ -145,7 +145,7 @@ def _sentences(placed: Placement) -> list[str]:
         if test := placed.ranks.above.get(row):
             verdict = "told" if test.told_apart else "not told"
             text += f" It is {verdict} from {test.first}, the row above it: "
-            text += f"{difference_text(test, metric.name)} below it."
+            text += f"{difference_text(test)} below it."
         if row in placed.published:
             text += " The board has that row with the same numbers."
         elif row in placed.replaced:

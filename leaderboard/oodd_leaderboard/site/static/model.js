@@ -160,6 +160,7 @@ function signed(share, digits = 1) {
 /** A tested difference in points and its interval, with digits enough to show whether it leaves out 0. */
 function gapTexts({ difference, low, high, told }) {
   const ends = [low, high].filter(isNumber);
+  if (!ends.length) return [signed(difference), "(no interval: too few test episodes)"];
   const digits = [1, 2, 3].find((n) => ends[told ? "every" : "some"]((end) => Number((100 * end).toFixed(n)))) ?? 4;
   return [signed(difference, digits), `[${signed(low, digits)}, ${signed(high, digits)}]`];
 }
