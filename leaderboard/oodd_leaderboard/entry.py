@@ -151,7 +151,7 @@ _RULES: Final = {
 
 
 def read_entries(directory: Path) -> list[Entry]:
-    """Read the entries of a directory in the order of their names.
+    """Read the entries of a directory, or the one whose directory it is, in the order of names.
 
     `ResultsError`: there is none, two have one name, or one distribution has two ranked rows.
     """

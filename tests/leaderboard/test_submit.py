@@ -47,6 +47,7 @@ def test_an_entry_has_wheel_digest_parameters_and_records(home, capsys):
     assert submit(results, "--detector", "mine", "--wheel", WHEEL, "--year", 2026, *options) == 0
     assert "leaderboard season --entries" in " ".join(capsys.readouterr().out.split())
     (entry,) = read_entries(home / "leaderboard" / "entries")
+    assert read_entries(home / "leaderboard" / "entries" / "mine") == [entry]
     assert entry == Entry(
         "mine", wheel=WHEEL, sha256=hashlib.sha256(b"a wheel").hexdigest(), detector="mine",
         parameters={"window": 3, "scales": [0.1, 1e-5], "fast": True}, training="simulation",

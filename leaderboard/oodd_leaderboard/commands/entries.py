@@ -102,7 +102,8 @@ def submit(options: Options) -> int:
         size = sum(p.stat().st_size for p in path.rglob("*"))
         console.print(
             f"\nwritten to {path}, {size / 1e6:.2g} MB; next:\n"
-            f"  oodd-eval leaderboard season --entries {options.entries} --env cartpole\n"
+            f"  oodd-eval leaderboard season --entries {path} --env cartpole "
+            "--train 12 --calibration 40 --test 4 --output my-season\n"
             f"  git add {path}\n"
             "commit it alone, and open a pull request (docs/submitting.md)",
             markup=False,
