@@ -264,16 +264,20 @@ def unranked(ranks: OrderedBoard) -> list[str]:
 def first_rows(ranks: OrderedBoard) -> list[str]:
     """Return which row is first, and whether it is told from the second; nothing without ranks."""
     places = [row for row in ranks.standings if row.rank]
-    if len(places) < 2:
+    if not places:
         return []
-    best, second = places[:2]
-    test, board = ranks.first[second.entry], ranks.board
+    best, *rest = places
+    board = ranks.board
     cells = board.environments, board.anomalies
     mean = board.mean(best.entry, *cells, board.ranking, intervals=True)
     by = f" by {best.authors}" * bool(best.authors) + f" ({best.year})" * bool(best.year)
-    noun, told = metric_info(board.ranking).noun, "told" if test.told_apart else "not told"
-    text = f"Best: {best.entry}{by}, {noun} {tables.show_value(mean, board.ranking)}. It is {told} "
-    text += f"from the second, {second.entry}: the difference is "
+    noun, figure = metric_info(board.ranking).noun, tables.show_value(mean, board.ranking)
+    text = f"Best: {best.entry}{by}, {noun} {figure}."
+    if not rest:
+        return [f"{text} There is no second ranked row."]
+    test = ranks.first[rest[0].entry]
+    told = "told" if test.told_apart else "not told"
+    text += f" It is {told} from the second, {rest[0].entry}: the difference is "
     lines = [f"{text}{difference_text(test)}."]
     if (band := sum(row.band for row in places)) > 2:
         lines.append(f"The first band has {band} rows: none of them is told from the first.")

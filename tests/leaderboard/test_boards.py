@@ -88,6 +88,8 @@ def test_places_say_what_is_told_apart(season):
 def test_rows_that_are_not_told_apart_share_the_first_rank():
     close = helpers_site.season(rows=("rf", "mine", "clock"))
     assert [row.rank for row in close.ranks.standings] == [1, 1, 3]
+    (sentence,) = first_rows(helpers_site.season(rows=("rf",)).ranks)
+    assert sentence.endswith("There is no second ranked row.")
     (sentence,) = first_rows(close.ranks)
     assert re.search(r"It is not told from the second, \w+: the difference is .*\]\.$", sentence)
 

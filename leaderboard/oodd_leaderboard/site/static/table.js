@@ -345,7 +345,7 @@ function what(board, rows, inOrder) {
   const cells = cellsOf(board, state).length;
   const environment = state.environment === "*" ? "all environments" : environmentOf(board, state.environment);
   const anomaly = state.anomaly === "*" ? "all anomalies" : state.anomaly[0] === "*" ? `${state.anomaly.slice(1)} anomalies` : anomalyOf(board, state.anomaly).title;
-  const shown = rows.length === board.rows.length ? `${rows.length} rows` : `${rows.length} of ${board.rows.length} rows`;
+  const shown = rows.length === board.rows.length ? `${rows.length} row${rows.length === 1 ? "" : "s"}` : `${rows.length} of ${board.rows.length} rows`;
   const marks = inOrder ? " Set off: the first band, rows not told from the first. =: not told from the row above." : "";
   return `${board.name}: ${environment}, ${anomaly} (means over ${cells} cell${cells === 1 ? "" : "s"}; ${shown}).${marks}`;
 }
@@ -355,7 +355,7 @@ function notesOf(board, rows) {
   const lines = [
     board.ranked && !selectsAll(board) && "Ranks are those over all cells of the board, whatever is selected.",
     board.ranked && rows.some((row) => row.seeds.length > 1) && `Every row has the same detector seeds (${board.season.seeds.join(", ")}), or one seed where it has no randomness. Intervals are over test episodes.`,
-    Object.values(board.strengths).some(Boolean) && "Every cell has a strength of its own, which its column in one environment and its page name: means are over these strengths.",
+    Object.values(board.strengths).some(Boolean) && "Every cell has a strength of its own: the table of one environment and the page of a row name it, and means are over these strengths.",
     ...board.about,
     rows.some((row) => mean(board, row, board.ranking, state).partial) && "* A mean over fewer cells than other rows have.",
   ];
