@@ -61,7 +61,7 @@ def standings_csv(ordered: OrderedBoard) -> str:
     return csv_rows(lines)
 
 
-def cells_csv(lines: Sequence[tuple[Mapping[str, str], Record]], *, header: bool = True) -> str:
+def cells_csv(lines: Sequence[tuple[Mapping[str, str], Record]]) -> str:
     """Return one line per cell with its stored metrics and their intervals.
 
     Every cell has a mapping with columns that stand before its own, the same ones for all. Every
@@ -94,10 +94,9 @@ def cells_csv(lines: Sequence[tuple[Mapping[str, str], Record]], *, header: bool
         }
         for about, r in lines
     ]
-    first = [[*facts[0], *_columns(NAMES)]] if header else []
     metrics = (_texts(map(r.metrics.get, NAMES)) for _, r in lines)
     rows = ([*cell.values(), *texts] for cell, texts in zip(facts, metrics, strict=True))
-    return csv_text([*first, *rows])
+    return csv_text([[*facts[0], *_columns(NAMES)], *rows])
 
 
 def _columns(names: Iterable[str]) -> list[str]:

@@ -31,6 +31,7 @@ from oodd_eval.data.bounded import read_toml
 from oodd_eval.errors import ResultsError, UnknownNameError
 from oodd_eval.names import check_known
 from oodd_eval.plugins.contract import Training
+from oodd_eval.plugins.installed import normalized
 from oodd_leaderboard import formats
 
 ENTRY: Final = "entry.toml"
@@ -99,7 +100,7 @@ class Entry:
             return "oodd-eval"
         text = self.wheel.partition("-")[0] if self.wheel else self.requirement
         name = re.match(r"[A-Za-z0-9._-]*[A-Za-z0-9]", text)
-        return re.sub(r"[-_.]+", "-", name[0] if name else text).lower()
+        return normalized(name[0] if name else text)
 
 
 def read_entry(path: Path) -> Entry:

@@ -25,7 +25,6 @@ MOST_COST: Final = 1e9  # seconds (thirty years) or megabytes: nobody measured m
 
 _DEEPEST: Final = 8  # levels of a JSON value
 _MOST_ITEMS: Final = 2000  # of one of its lists and objects
-_BLANK: Final = "\u115f\u1160\u2800\u3164\uffa0"  # letters and signs that show nothing
 
 _SHORT: Final = reprlib.Repr()
 _SHORT.maxstring = _SHORT.maxother = 60
@@ -52,10 +51,9 @@ def _matching(pattern: str, expected: str) -> Rule:
     return Rule(re.compile(pattern, re.ASCII).fullmatch, expected)
 
 
-def _is_text(value: str, longest: int = LONGEST_TEXT, least: int = 0) -> bool:
+def _is_text(value: str, longest: int = LONGEST_TEXT) -> bool:
     marked = any(mark in value for mark in ("<", ">", "]("))
-    seen = sum(c not in _BLANK and not c.isspace() for c in value)
-    return least <= seen and len(value) <= longest and value.isprintable() and not marked
+    return len(value) <= longest and value.isprintable() and not marked
 
 
 def text(longest: int) -> Rule:

@@ -4,7 +4,6 @@ Two questions are asked of ranked rows: is a row told from the row above it, and
 first? Each is corrected for as many pairs as there are rows below the first.
 """
 
-import functools
 import itertools
 import math
 from collections import Counter
@@ -23,7 +22,7 @@ from oodd_eval.results.board import Board, cells_with, expected_cells, grouped
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import NAN, Record
 from oodd_eval.results.standings import terms_of
-from oodd_eval.results.tables import Tables, best_first
+from oodd_eval.results.tables import best_first
 from oodd_leaderboard.entry import Entry
 
 EQUAL: Final = "="
@@ -103,16 +102,8 @@ class Standing:
         mark = training_mark(self.training)
         return marks + (f" ({mark})" if mark else "")
 
-    @property
-    def labels(self) -> list[str]:
-        """Its place, marked name, and settings with the number of seeds."""
-        overrides = [f"{k}={v}" for k, v in self.entry.overrides.items()]
-        several = [f"{self.seeds} seeds"] if self.seeds > 1 else []
-        settings = ", ".join([f"Δ={self.entry.horizon}", *overrides, *several])
-        return [self.printed_rank, self.entry.detector + self.marks, settings]
 
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class OrderedBoard:
     """A board in order, with what is known of differences in the metric that ranks.
 
@@ -130,12 +121,6 @@ class OrderedBoard:
     standings: list[Standing]
     above: dict[Setting, PairedDifference]
     first: dict[Setting, PairedDifference]
-
-    @functools.cached_property
-    def tables(self) -> Tables:
-        """The board's tables, with each row's place and settings, and intervals."""
-        labels = {row.entry: row.labels for row in self.standings}
-        return Tables(self.board, True, labels, ("rank", "detector", "settings"))
 
 
 def ordered(

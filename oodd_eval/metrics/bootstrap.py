@@ -43,32 +43,22 @@ _DIGITS: Final = 4  # of an end to which draws of the calibration have added
 _NOISE: Final = 1e-12  # relative difference that is taken for rounding
 
 
-def bootstrap_weights(
-    n: int, *, key: str = "", resamples: int = RESAMPLES, seed: int = 0
-) -> Weights:
+def bootstrap_weights(n: int, *, key: str = "", resamples: int = RESAMPLES) -> Weights:
     """Return counts of each of n trajectories in each resample: shape (resamples, n).
 
-    The same seed and key, such as an environment, give the same weights, and so the same intervals.
+    The same key, such as an environment, gives the same weights, and so the same intervals.
     """
     if not n:
         return np.zeros((resamples, 0))
-    rng = np.random.default_rng([seed, zlib.crc32(key.encode()), n])
+    rng = np.random.default_rng([0, zlib.crc32(key.encode()), n])
     # In this order sums over trajectories take half as long.
     return rng.multinomial(n, np.full(n, 1 / n), size=resamples).astype(np.float64, order="F")
 
 
 @functools.lru_cache(maxsize=64)
-def shared_weights(environment: str, n: int) -> Weights:
-    """Return the weights of an environment's n test trajectories, kept for the next cell."""
-    weights = bootstrap_weights(n, key=environment)
-    weights.setflags(write=False)
-    return weights
-
-
-@functools.lru_cache(maxsize=16)
-def _anomalous_weights(environment: str, condition: str, n: int) -> Weights:
-    """Return the weights of a condition's n episodes without twins."""
-    weights = bootstrap_weights(n, key=f"{environment}/{condition}")
+def shared_weights(key: str, n: int) -> Weights:
+    """Return the weights of n test trajectories of an environment, kept for the next cell."""
+    weights = bootstrap_weights(n, key=key)
     weights.setflags(write=False)
     return weights
 
@@ -91,7 +81,7 @@ def cell_samples(environment: str, contribution: Contribution, condition: str = 
         return resampled(contribution, shared_weights(environment, n))
     numerator, denominator = (
         _drawn(terms[:m], shared_weights(environment, m))
-        + _drawn(terms[m:], _anomalous_weights(environment, condition, n - m))
+        + _drawn(terms[m:], shared_weights(f"{environment}/{condition}", n - m))
         for terms in (contribution.numerator, contribution.denominator)
     )
     return np.divide(numerator, np.where(denominator > 0, denominator, np.nan))
@@ -316,7 +306,7 @@ def _of_calibration(cells: Sequence[DrawnCells]) -> tuple[float, float]:
     return min(low, 0.0), max(high, 0.0)
 
 
-def calibration_samples(cells: Sequence[DrawnCells], resamples: int = RESAMPLES) -> Samples:
+def calibration_samples(cells: Sequence[DrawnCells]) -> Samples:
     """Return by how much calibration changes a mean over cells in every resample.
 
     Cells of one environment share the draws; environments are drawn apart. Those of one alone are
@@ -336,9 +326,9 @@ def calibration_samples(cells: Sequence[DrawnCells], resamples: int = RESAMPLES)
                 totals[key] = totals.get(key, np.zeros(len(part))) + part
     if len(totals) < 2:
         return next(iter(totals.values()), np.zeros(1))
-    samples = np.zeros(resamples)
+    samples = np.zeros(RESAMPLES)
     for (environment, draws), total in totals.items():
-        samples += total[calibration_draws(environment, draws, resamples)]
+        samples += total[calibration_draws(environment, draws, RESAMPLES)]
     return samples
 
 

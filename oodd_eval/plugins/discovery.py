@@ -117,30 +117,6 @@ class Broken(NamedTuple):
     reason: str
 
 
-class Offering(Protocol):
-    """The offer of a plug-in: one that is loaded, or one that a sandbox has described."""
-
-    @property
-    def point(self) -> EntryPoint:
-        """Its entry point."""
-
-    @property
-    def form(self) -> str:
-        """The form of names with a colon that it knows, in its words; empty if none."""
-
-    def specs(self) -> list[DetectorSpec]:
-        """Return its detectors, checked."""
-
-    def from_spec(self, text: str) -> DetectorSpec | None:
-        """Return the detector for a `maker:name` text, or None if it does not know the maker."""
-
-    def custom_specs(self) -> list[Spec]:
-        """Return its environments and anomalies, checked."""
-
-    def listed(self, hook: str, kind: type[_Spec]) -> list[_Spec]:
-        """Return what one of its hooks offers, if these are lists of one kind."""
-
-
 @dataclass(frozen=True, slots=True)
 class Plugin:
     """A loaded plug-in: its entry point and its hooks."""
@@ -208,10 +184,10 @@ class Plugins:
         self,
         points: list[EntryPoint],
         observer_points: list[EntryPoint],
-        load: Callable[[EntryPoint], Offering] | None = None,
+        load: Callable[[EntryPoint], Plugin] | None = None,
         packages: Sequence[Path] = (),
     ) -> None:
-        self.loaded: dict[str, Offering] = {}
+        self.loaded: dict[str, Plugin] = {}
         self.broken: list[Broken] = []
         self.notes: list[str] = []
         self.points, self.observer_points = points, observer_points
@@ -245,7 +221,7 @@ class Plugins:
         A plug-in is broken when `check` raises for something that it offers.
         """
 
-        def checked(plugin: Offering) -> list[_Spec]:
+        def checked(plugin: Plugin) -> list[_Spec]:
             specs = plugin.listed(hook, kind)
             for spec in specs:
                 check(spec)
@@ -318,7 +294,7 @@ class Plugins:
             if self._listener:
                 self._listener(self.broken[-1])
 
-    def _offered(self, of: Callable[[Offering], list[_Spec]]) -> dict[str, tuple[_Spec, str]]:
+    def _offered(self, of: Callable[[Plugin], list[_Spec]]) -> dict[str, tuple[_Spec, str]]:
         """Return what all plug-ins offer by name, with its origin; no name is offered twice."""
         for point in list(self._waiting):
             self._load(point)
@@ -355,7 +331,7 @@ class Plugins:
             self._offers |= offers
             self.loaded[point.name] = plugin
 
-    def _makers(self) -> Iterator[tuple[Offering, str]]:
+    def _makers(self) -> Iterator[tuple[Plugin, str]]:
         """Yield plug-ins that make detectors of names with a colon, this distribution's first."""
         # Each comes with the names that it knows.
         for point in self.points:
@@ -399,7 +375,7 @@ def discover(
     disabled: Collection[str] = (),
     *,
     only: Collection[str] | None = None,
-    load: Callable[[EntryPoint], Offering] | None = None,
+    load: Callable[[EntryPoint], Plugin] | None = None,
     packages: Sequence[Path] = (),
 ) -> Plugins:
     """Find the installed plug-ins, without loading any; those `disabled` are left out.

@@ -6,7 +6,6 @@ import math
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field
-from statistics import NormalDist
 from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
@@ -15,7 +14,7 @@ from oodd_eval.data.condition import Condition, conditions_of
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, SPLITS, in_order
 from oodd_eval.data.split import published_digests
 from oodd_eval.metrics.auc import Contribution
-from oodd_eval.metrics.bootstrap import LEVEL, DrawnCells, mean_interval, mean_over_cells, nan_mean
+from oodd_eval.metrics.bootstrap import DrawnCells, mean_interval, mean_over_cells, nan_mean
 from oodd_eval.metrics.catalogue import ALARM_RANKING, HEADLINE, LEVELS, NAMES, RANKING, metric_info
 from oodd_eval.metrics.ranking import Position
 from oodd_eval.results.identity import Setting
@@ -389,30 +388,3 @@ def _values_of(records: Sequence[Record], metric: str) -> list[float]:
     for i in set(range(len(records))) - with_terms:
         values[i] = records[i].value(metric)
     return values
-
-
-def standard_error(records: Iterable[Record], metric: str) -> float:
-    """Return the standard error of a row's mean of a metric over the cells of one environment.
-
-    It is a quarter of the width of the mean's 95 % interval, more exactly the width in units of
-    that of a normal distribution: test episodes and, for metrics of alarms, calibration episodes
-    are in it, and a share that is 0 or 1 everywhere is not taken to be exact.
-
-    Parameters
-    ----------
-    records
-        Of the row, with all its seeds.
-    metric
-        One that is a ratio of sums over trajectories.
-
-    Returns
-    -------
-    float
-        In the unit of records; NaN where no record has the metric.
-    """
-    cells = [*_drawn_cells(list(records), metric).values()]
-    low, high = mean_interval(cells, kind=metric_info(metric).interval) if cells else (NAN, NAN)
-    return (high - low) / (2 * _NORMAL)
-
-
-_NORMAL: Final = NormalDist().inv_cdf((1 + LEVEL) / 2)

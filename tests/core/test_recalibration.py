@@ -22,7 +22,7 @@ from oodd_eval.metrics.cusum import Standardization
 from oodd_eval.metrics.ranking import differences
 from oodd_eval.metrics.recalibration import DRAWS, PairedScores, Recalibration, drawn, thresholds
 from oodd_eval.metrics.unpaired import UnpairedScores, unpaired_alarms
-from oodd_eval.results.board import standard_error
+from oodd_eval.results.board import Board
 from oodd_eval.results.record import STEPS, CodedDraws, Record
 
 
@@ -217,18 +217,25 @@ def test_environments_are_drawn_apart_and_cells_of_one_together():
     assert np.ptp(np.bincount(order)) <= 1
 
 
-def test_the_standard_error_has_both_sources_of_noise():
+def width(one, metric):
+    """Width of the interval of a record's mean, in standard errors."""
+    board = Board([one])
+    mean = board.mean(one.setting, [one.environment], [one.anomaly], metric, intervals=True)
+    return (mean.high - mean.low) / (2 * 1.96)
+
+
+def test_an_interval_has_both_sources_of_noise():
     terms = np.array([[0.2, 0.4, 0.6, 0.8], np.ones(4)])
     plain = record(per_trajectory={"missed": terms})
     noise = np.random.default_rng(0).normal(0, 0.2, size=DRAWS)
     noisy = replace(plain, calibration_draws=CodedDraws.of({"missed": noise}))
-    alone, both = (standard_error([r], "missed") for r in (plain, noisy))
+    alone, both = (width(r, "missed") for r in (plain, noisy))
     assert 0.1 < alone < 0.2
     assert both == pytest.approx(math.hypot(alone, 0.2), rel=0.15)
     # A share of 1 everywhere is not exact.
     certain = record(per_trajectory={"missed": np.ones((2, 10))})
-    assert standard_error([certain], "missed") > 0.05
-    assert math.isnan(standard_error([certain], "far"))
+    assert width(certain, "missed") > 0.05
+    assert math.isnan(width(certain, "far"))
 
 
 @pytest.mark.slow
@@ -239,5 +246,5 @@ def test_a_run_of_mini_keeps_draws_and_leaves_aucs_as_they_are(tmp_path):
     for one in records:
         plain = replace(one, calibration_draws=CodedDraws())
         assert len(one.calibration_draws) > 30
-        widths = [standard_error([r], "delay_censored_at_5pct") for r in (plain, one)]
+        widths = [width(r, "delay_censored_at_5pct") for r in (plain, one)]
         assert widths[0] < widths[1]

@@ -8,15 +8,15 @@ is never the plug-in's to say: the command reads it from the installed distribut
 
 import os
 import sys
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NoReturn
+from types import SimpleNamespace
+from typing import Any, Final, NoReturn
 
 from oodd_eval.errors import PluginError, UsageError
-from oodd_eval.plugins import PROJECT
+from oodd_eval.plugins import PROJECT, hookimpl
 from oodd_eval.plugins.contract import Detector, DetectorSpec
 from oodd_eval.plugins.discovery import (
     Plugin,
@@ -26,6 +26,7 @@ from oodd_eval.plugins.discovery import (
     distribution_of,
     plugin_of,
     printable,
+    register,
     staying,
 )
 from oodd_eval.plugins.isolation import ChannelClosedError, ChannelGarbledError
@@ -35,9 +36,6 @@ from oodd_eval.plugins.specs import MOST_SPECS, is_line
 from oodd_leaderboard.sandbox.described_specs import description_of, spec_of
 from oodd_leaderboard.sandbox.launcher import make_sandbox
 from oodd_leaderboard.sandbox.metadata import check_packages
-
-if TYPE_CHECKING:
-    from oodd_eval.data.registry import Spec
 
 SECONDS: Final = (
     60.0  # for the plug-ins of one distribution to be imported and to say what they offer
@@ -81,37 +79,6 @@ def sandboxed_plugins(
     return launcher, discover_entry(Path(packages[0]), launcher, memory)
 
 
-@dataclass(frozen=True, slots=True)
-class DescribedPlugin:
-    """A plug-in as a sandbox has described it; its detectors can run in sandboxes alone."""
-
-    point: EntryPoint
-    form: str
-    described: Sequence[DetectorSpec]
-    ask: Callable[[str], Answer] = field(repr=False)
-
-    def specs(self) -> list[DetectorSpec]:
-        """Return its detectors."""
-        return [*self.described]
-
-    def from_spec(self, text: str) -> DetectorSpec | None:
-        """Have a sandbox ask it what it makes of a name with a colon."""
-        answer = self.ask(text)
-        if refused := answer.get("refused"):
-            raise UsageError(printable(str(refused)))
-        with _wrong_form():
-            return None if answer["spec"] is None else spec_of(answer["spec"], _in_a_sandbox)
-
-    def custom_specs(self) -> list["Spec"]:
-        """Return nothing: what can be recorded is recorded outside."""
-        return []
-
-    def listed(self, hook: str, kind: type[Any]) -> list[Any]:
-        """Return nothing: logs are read outside."""
-        del hook, kind
-        return []
-
-
 class _Describer:
     """Has a sandbox load the plug-ins of a distribution, all at once, when one is needed."""
 
@@ -120,7 +87,8 @@ class _Describer:
         self._launcher, self._limits = launcher, Limits(SECONDS, memory)
         self._answers: dict[tuple[str, str], Answer] = {}
 
-    def _load(self, point: EntryPoint) -> DescribedPlugin:
+    def _load(self, point: EntryPoint) -> Plugin:
+        """Return a plug-in whose hooks say what a sandbox says of it."""
         distribution = distribution_of(point)
         key = distribution, point.name
         if key not in self._answers:
@@ -135,10 +103,23 @@ class _Describer:
                 raise PluginError(f"it describes {len(described)} detectors, and {form!r:.80}")
             specs = [spec_of(description, _in_a_sandbox) for description in described]
 
-        def ask(text: str) -> Answer:
-            return _unbroken(self._ask(distribution, [point.name], text)[point.name])
+        @hookimpl
+        def oodd_detectors() -> list[DetectorSpec]:
+            return specs
 
-        return DescribedPlugin(point, form, specs, ask)
+        @hookimpl
+        def oodd_detector_from_spec(spec: str) -> DetectorSpec | None:
+            answer = _unbroken(self._ask(distribution, [point.name], spec)[point.name])
+            if refused := answer.get("refused"):
+                raise UsageError(printable(str(refused)))
+            with _wrong_form():
+                return None if answer["spec"] is None else spec_of(answer["spec"], _in_a_sandbox)
+
+        hooks = SimpleNamespace(oodd_detectors=oodd_detectors)
+        if form:
+            oodd_detector_from_spec.__doc__ = form
+            hooks.oodd_detector_from_spec = oodd_detector_from_spec
+        return Plugin(point, register(hooks))
 
     def _ask(self, distribution: str, names: list[str], text: str = "") -> dict[str, Answer]:
         """Return the answers of plug-ins by name: nothing but a mapping is sure of each."""

@@ -5,13 +5,7 @@ from typing import Any, Final
 
 from oodd_eval.plugins.contract import Detector, DetectorSpec
 from oodd_eval.plugins.parameters import ParameterInfo, parameters_of
-from oodd_eval.plugins.specs import (
-    FIELDS,
-    PLAIN_TYPES,
-    check_count,
-    check_detector_spec,
-    declared_as,
-)
+from oodd_eval.plugins.specs import FIELDS, PLAIN_TYPES, check_count, declared_as
 
 Description = dict[str, Any]
 """A spec as values that JSON knows, without its factory."""
@@ -31,18 +25,17 @@ def description_of(spec: DetectorSpec) -> Description:
 
 
 def spec_of(description: Mapping[str, Any], factory: Callable[..., Detector]) -> DetectorSpec:
-    """Return the spec that `description_of` described elsewhere, checked.
+    """Return the spec that `description_of` described elsewhere.
 
-    Raises `PluginError`, or what Python raises for values of another form.
+    Raises `PluginError`, or what Python raises for values of another form. Its fields are checked
+    as those of every plug-in's are, see `plain_spec`.
     """
     values = {**description, "requires": tuple(description["requires"])}
     if (declared := description["parameters"]) is not None:
         check_count(declared)
         infos = {name: _info(facts) for name, facts in declared.items()}
         values["parameters"] = declared_as(infos)
-    spec = DetectorSpec(factory=factory, **values)
-    check_detector_spec(spec)
-    return spec
+    return DetectorSpec(factory=factory, **values)
 
 
 def _described(info: ParameterInfo) -> Description:
