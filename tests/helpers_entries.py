@@ -1,31 +1,17 @@
-"""Entries of strangers: wheels, which are zip files, and what an entry says of them."""
+"""Entries of strangers: wheels with a plug-in, and what an entry says of them."""
 
 import hashlib
-import zipfile
 from pathlib import Path
 
+import helpers_wheel
 from helpers_plugins import HEADER
 
-WHEEL = "Wheel-Version: 1.0\nGenerator: a test\nRoot-Is-Purelib: true\nTag: py3-none-any\n"
 
-
-def write_wheel(directory, distribution, files, *, plugin, module, version="1.0"):
+def write_wheel(directory, distribution, files, *, plugin, module):
     """Write a wheel of some files by name, with one plug-in; return its path."""
-    stem = f"{distribution.replace('-', '_')}-{version}"
-    info = f"{stem}.dist-info"
-    files = {
-        **files,
-        f"{info}/METADATA": f"Metadata-Version: 2.1\nName: {distribution}\nVersion: {version}\n",
-        f"{info}/WHEEL": WHEEL,
-        f"{info}/entry_points.txt": f"[oodd_eval]\n{plugin} = {module}\n",
-    }
-    record = "".join(f"{name},,\n" for name in (*files, f"{info}/RECORD"))
-    directory.mkdir(parents=True, exist_ok=True)
-    path = directory / f"{stem}-py3-none-any.whl"
-    with zipfile.ZipFile(path, "w") as wheel:
-        for name, content in {**files, f"{info}/RECORD": record}.items():
-            wheel.writestr(name, content)
-    return path
+    points = f"{distribution.replace('-', '_')}-1.0.dist-info/entry_points.txt"
+    files = {**files, points: f"[oodd_eval]\n{plugin} = {module}\n"}
+    return helpers_wheel.write_wheel(directory, distribution, "1.0", files)
 
 
 def write_entry(entries, name, wheel, *lines, sha256=None):

@@ -68,8 +68,8 @@ def log_arrays(episodes, *, labelled, sensors=3, actions=1):
     return arrays
 
 
-def write_log_split(directory, parts, facts=UNPAIRED, *, name="arm", environment="arm"):
-    """Write episodes by part (``"train"``, ``"test/slip"``); return the directory.
+def write_log_environment(directory, parts, facts=UNPAIRED, *, environment="arm"):
+    """Write an environment's episodes by part (``"train"``, ``"test/slip"``); return its entry.
 
     A part that is not named is empty; `facts` must not say that episodes are paired.
     """
@@ -81,15 +81,25 @@ def write_log_split(directory, parts, facts=UNPAIRED, *, name="arm", environment
         (part, log_arrays(parts.get(part, []), labelled=part not in nominal, sensors=sensors))
         for part in (*nominal, *(f"test/{kind}" for kind in kinds))
     ]
-    entry = write_environment(
+    return write_environment(
         directory / f"{environment}.h5", groups, "0" * 64,
         sensors=[Quantity(f"q{i}", "rad") for i in range(sensors)],
         actions=[Quantity("cmd", "V")],
         custom=own_facts(environment, discrete=False, groups=dict.fromkeys(kinds, "dynamics")),
         logs=facts,
     )  # fmt: skip
+
+
+def write_log_split(directory, parts, facts=UNPAIRED, *, name="arm", environment="arm"):
+    """Write a split of one environment, see `write_log_environment`; return the directory."""
+    entry = write_log_environment(directory, parts, facts, environment=environment)
+    return write_log_manifest(directory, {environment: entry}, name=name)
+
+
+def write_log_manifest(directory, environments, *, name):
+    """Write the manifest of a split of logs; return the directory."""
     recipe = {"name": name, "source": "imported"}
-    write_manifest(directory, recipe, {environment: entry}, generator=0, versions={})
+    write_manifest(directory, recipe, environments, generator=0, versions={})
     return directory
 
 

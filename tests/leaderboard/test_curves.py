@@ -25,7 +25,7 @@ from oodd_leaderboard.curves import (
 from oodd_eval import evaluate
 from oodd_eval.data.split import load_split
 from oodd_eval.errors import ResultsError
-from oodd_eval.metrics.auc import AlarmRule, alarm_contributions, auc, auc_contributions
+from oodd_eval.metrics.auc import AlarmRule, alarm_contributions, auc_contributions
 from oodd_eval.metrics.cusum import THRESHOLD, UNIT, Standardization, cusum
 from oodd_eval.results.directory import ResultsDirectory
 
@@ -68,17 +68,6 @@ def test_roc_is_the_polygon_of_counted_rates(positives, negatives):
                 value = max(value, y[i] + share * (y[i + 1] - y[i]))
         expected.append(value)
     np.testing.assert_allclose(roc(positives, negatives, np.array(FPR)), expected, atol=1e-12)
-
-
-@given(st.integers(0, 10**6))
-def test_area_under_one_curve_is_its_auc(seed):
-    rng = np.random.default_rng(seed)
-    positives, negatives = (
-        rng.integers(0, 9, 30).astype(float),
-        rng.integers(0, 7, 40).astype(float),
-    )
-    area = np.trapezoid(roc(positives, negatives, FINE), FINE)
-    assert area == pytest.approx(auc(positives, negatives), abs=2e-4)
 
 
 def test_area_under_the_averaged_curve_is_the_matched_auc():

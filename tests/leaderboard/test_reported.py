@@ -5,7 +5,6 @@ import lzma
 
 import pytest
 from helpers_records import example, make_record
-from oodd_leaderboard.curve_file import read_curves
 from oodd_leaderboard.entry import Entry
 from oodd_leaderboard.pages import build, differences, read_leaderboard
 from oodd_leaderboard.reported import (
@@ -153,25 +152,3 @@ def test_the_same_records_give_the_same_files(leaderboard, tmp_path):
     assert differences(tmp_path / "one", tmp_path / "two") == sorted(
         [f"{table}: differs", "tables/old.csv: no part of the leaderboard any more"]
     )
-
-
-CURVES = {
-    "rate-above-one": ("units.0.roc.tpr.3", 1.5),
-    "unknown-field": ("units.0.code", "x"),
-    "not-a-number": ("units.0.roc.tpr.3", float("nan")),
-    "schema": ("schema", 2),
-}
-
-
-@pytest.mark.parametrize("case", CURVES)
-def test_wrong_curves_are_refused_by_their_field(tmp_path, request, case):
-    path, value = CURVES[case]
-    file = request.config.rootpath / "leaderboard/results/oracles-mini/curves.json"
-    plain = inner = json.loads(file.read_text())
-    *parents, last = path.split(".")
-    for name in parents:
-        inner = inner[int(name) if name.isdigit() else name]
-    inner[int(last) if last.isdigit() else last] = value
-    (tmp_path / "curves.json").write_text(json.dumps(plain))
-    with pytest.raises(ResultsError, match=r"curves\.json"):
-        read_curves(tmp_path / "curves.json")

@@ -9,7 +9,6 @@ from oodd_leaderboard.season_files import read_season, row_path, write_season
 
 from oodd_eval import load_split
 from oodd_eval.cli.main import main
-from oodd_eval.results.directory import read_records
 
 pytestmark = [
     pytest.mark.slow,
@@ -75,28 +74,11 @@ def test_a_whole_season_has_a_page_and_a_site(whole):
     assert (whole / "site" / "index.html").is_file()
 
 
-def test_rows_without_all_cells_are_told(whole):
-    read = read_season(whole)
-    records = read.records(whole)
-    assert read.missing(r for r in records if r.detector != "random") == ["random: not run"]
-    few = [r for r in records if (r.detector, r.environment, r.seed) != ("random", "tank", 1)]
-    (line,) = read.missing(few)
-    assert line.startswith("random")
-    assert "tank" in line
-    assert "cartpole" not in line
-
-
 def test_what_fails_is_the_reason_of_a_row(whole):
     by_environment = {r.environment: r for r in steady(whole) if r.detector == "oracle-gym"}
     assert by_environment["tank"].status == "incompatible"
     assert by_environment["tank"].reason
     assert by_environment["cartpole"].ok
-
-
-def test_a_row_has_the_name_of_its_entry(whole):
-    (records,) = (read_records(row_path(whole, "short")),)
-    assert {r.detector for r in records} == {"short"}
-    assert {r.overrides["clip"] for r in records} == {2.0}
 
 
 def test_killed_at_three_moments_it_goes_on_to_the_same_records(whole, entries, tmp_path):

@@ -2,17 +2,16 @@
 
 import shutil
 import sys
-from contextlib import closing
 from pathlib import Path
 
 import adversaries
 import numpy as np
 import pytest
 from helpers_entries import write_entry, write_plugin_entry, write_wheel
+from helpers_plugins import table_of
 from oodd_leaderboard.season_files import read_season
 from oodd_leaderboard.standings import ordered
 
-from oodd_eval import load_split
 from oodd_eval.cli.main import main
 
 pytestmark = [
@@ -120,16 +119,6 @@ class Near(Honest):
 def oodd_detectors():
     return [DetectorSpec("near", Near, "a copy", deterministic=True)]
 """
-
-
-def table_of(split):
-    """Return the module in which an adversary keeps the twins of a split's CartPole."""
-    cells = bytearray(adversaries.CELLS)
-    with closing(load_split(split).environment("cartpole")) as data:
-        for twin in data.twins:
-            adversaries.remember(twin.observations, np.array([0, len(twin) - 1]), cells)
-    known = np.flatnonzero(np.frombuffer(cells, np.uint8)).astype("<u4")
-    return f"CELLS = {known.tobytes().hex()!r}\n"
 
 
 @pytest.fixture(scope="module")
