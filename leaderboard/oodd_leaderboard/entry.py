@@ -117,10 +117,7 @@ def read_entry(path: Path) -> Entry:
         fields = json.dumps({"name": name, "detector": name, **content}, default=str)
         entry = TypeAdapter(Entry).validate_json(fields)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        at = ".".join(formats.short(str(part))[1:-1] for part in first["loc"])
-        value = formats.short(first["input"])
-        raise ResultsError(f"{path}: {at}: {first['msg']}, got {value}") from None
+        raise ResultsError(f"{path}: {formats.explained(error)}") from None
     for name, problem in _problems(entry):
         raise ResultsError(f"{path}: {name} {problem}")
     return entry

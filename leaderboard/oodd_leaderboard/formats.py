@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from pydantic import ValidationError
 
 from oodd_eval.data.facts import GROUPS, NAME_PATTERN
 from oodd_eval.errors import ResultsError
@@ -34,6 +35,13 @@ _SHORT.maxlevel = 2
 def short(value: Any) -> str:
     """Return a stranger's value, shortened and safe to print on a terminal."""
     return _SHORT.repr(value).encode("ascii", "backslashreplace").decode()
+
+
+def explained(error: ValidationError) -> str:
+    """Return the first field of a file that is wrong, and what is wrong with it."""
+    first = error.errors(include_url=False)[0]
+    at = ".".join(short(str(part))[1:-1] for part in first["loc"])
+    return f"{at}: {first['msg']}, got {short(first['input'])}"
 
 
 class Rule(NamedTuple):

@@ -112,11 +112,6 @@ def build(
     return list(files)
 
 
-def build_season(directory: Path) -> list[str]:
-    """Write page, tables and site of one season into its directory, and return their names."""
-    return build(read_leaderboard(directory), directory)
-
-
 def documents(leaderboard: Leaderboard, project: str = "../") -> dict[str, str | bytes]:
     """Return what is committed beside the records by name: page, tables, the published file."""
     files: dict[str, str | bytes] = {PAGE: page(leaderboard, project)}

@@ -26,6 +26,7 @@ from oodd_eval.names import counted
 from oodd_eval.results.directory import read_records
 from oodd_eval.results.record import Record
 from oodd_leaderboard.entry import Entry
+from oodd_leaderboard.formats import explained
 
 SCHEMA: Final = 1
 SEASON: Final = "season.json"
@@ -171,9 +172,7 @@ def read_season(directory: Path) -> Season:
     try:
         return _READER.validate_json(read_bytes(path, MANIFEST_BYTES, ResultsError))
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        at = ".".join(map(str, first["loc"]))
-        raise ResultsError(f"{path}: {at}: {first['msg']}, got {first['input']!r:.80}") from None
+        raise ResultsError(f"{path}: {explained(error)}") from None
 
 
 def write_season(season: Season, directory: Path) -> None:

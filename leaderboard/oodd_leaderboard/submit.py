@@ -5,7 +5,7 @@ import json
 import os
 import shutil
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -25,23 +25,7 @@ MOST_WHEEL: Final = 10**8  # bytes
 SHIPPED: Final = "oodd-eval"
 
 
-@dataclass(frozen=True, slots=True)
-class Statement:
-    """What records do not say of an entry: its name, what pip installs, and who made it."""
-
-    name: str = ""
-    wheel: Path | None = None
-    requirement: str = ""
-    sha256: str = ""
-    variant: bool = False
-    authors: str = ""
-    paper: str = ""
-    url: str = ""
-    year: int | None = None
-    licence: str = ""
-
-
-def submit(results: Path, row: str, root: Path, statement: Statement) -> Path:
+def submit(results: Path, row: str, root: Path, stated: Entry, wheel: Path | None = None) -> Path:
     """Write the entry of a row of a run, read it back, and return its directory.
 
     Parameters
@@ -52,17 +36,19 @@ def submit(results: Path, row: str, root: Path, statement: Statement) -> Path:
         Name of its detector, or a setting such as ``rf[trees=9]``.
     root
         Directory of the entries.
-    statement
-        What the records do not say.
+    stated
+        What the records do not say: name, requirement and digest, who made it.
+    wheel
+        What pip installs, if no requirement; it is copied.
 
     Raises
     ------
     UsageError
-        When records or statement make no entry; nothing is written then.
+        When these make no entry; nothing is written then.
     """
     source = ResultsDirectory(results)
     records = _publishable(source.records(), row)
-    entry = _entry(records, statement)
+    entry = _entry(records, stated, wheel)
     path = root / entry.name
     if os.path.lexists(path):
         raise UsageError(f"{str(path)!r} is there already: remove it first, or choose --name")
@@ -72,8 +58,8 @@ def submit(results: Path, row: str, root: Path, statement: Statement) -> Path:
             target = directory / entry.name
             target.mkdir()
             (target / ENTRY).write_text(to_toml(entry), encoding="utf-8")
-            if statement.wheel:
-                shutil.copyfile(statement.wheel, target / entry.wheel)
+            if wheel:
+                shutil.copyfile(wheel, target / entry.wheel)
             text = "".join(record.to_json() + "\n" for record in records)
             (target / RECORDS).write_text(text, encoding="utf-8")
             compress_large(target / RECORDS)
@@ -130,29 +116,29 @@ def _plain(record: Record) -> Record:
     return replace(record, reason=reason, provenance=origin)
 
 
-def _entry(records: Sequence[Record], statement: Statement) -> Entry:
+def _entry(records: Sequence[Record], stated: Entry, wheel: Path | None) -> Entry:
     """Return the entry of a row, its wheel's digest computed."""
     first = records[0]
     distribution = first.plugin.partition(":")[0]
-    values = asdict(statement) | {"wheel": ""}
-    if statement.wheel:
-        content = read_bytes(statement.wheel, MOST_WHEEL, ResultsError)
-        values |= {"wheel": statement.wheel.name, "sha256": hashlib.sha256(content).hexdigest()}
-    elif distribution != SHIPPED:
-        version = first.detector_version.partition("+")[0]
-        values["requirement"] = statement.requirement or f"{distribution}=={version}"
-        if not statement.sha256:
-            raise UsageError(
-                f"{distribution} is not shipped: name its wheel with --wheel, which `pip wheel "
-                "--no-deps` makes, or with --sha256 the digest of the file that pip installs"
-            )
-    entry = Entry(
-        **values | {"name": statement.name or first.detector.lower().replace(":", "-")},
+    entry = replace(
+        stated,
+        name=stated.name or first.detector.lower().replace(":", "-"),
         detector=first.detector,
         parameters=first.setting.overrides,
         horizon=first.horizon,
         training=first.training,
     )
+    if wheel:
+        digest = hashlib.sha256(read_bytes(wheel, MOST_WHEEL, ResultsError)).hexdigest()
+        entry = replace(entry, wheel=wheel.name, sha256=digest)
+    elif distribution != SHIPPED:
+        version = first.detector_version.partition("+")[0]
+        entry = replace(entry, requirement=stated.requirement or f"{distribution}=={version}")
+        if not stated.sha256:
+            raise UsageError(
+                f"{distribution} is not shipped: name its wheel with --wheel, which `pip wheel "
+                "--no-deps` makes, or with --sha256 the digest of the file that pip installs"
+            )
     if problem := formats.ENTRY_NAME.complaint(entry.name):
         raise UsageError(f"--name {problem}")
     if not entry.shipped and entry.distribution != distribution:

@@ -219,8 +219,8 @@ class Board:
         means = (nan_mean(by_seed[seed]) for seed in sorted(by_seed))
         return [mean for mean in means if not math.isnan(mean)]
 
-    def compare(self, first: Setting, second: Setting, metric: str) -> tuple[float, float, int]:
-        """Return both means over the cells that both have, and the number of those cells."""
+    def compare(self, first: Setting, second: Setting, metric: str) -> tuple[float, float]:
+        """Return both means over the cells that both have."""
         common = [
             (e, a)
             for e, a in itertools.product(self.environments, self.anomalies)
@@ -234,7 +234,13 @@ class Board:
             )
             for s in (first, second)
         )
-        return first_mean, second_mean, len(common)
+        return first_mean, second_mean
+
+    def worst(self, entry: Setting) -> tuple[str, Value] | None:
+        """Return the environment in which an entry's mean is lowest, and that mean."""
+        means = [(e, self.of(entry, Column(self.ranking, "", [e]))) for e in self.environments]
+        defined = [(e, mean) for e, mean in means if not math.isnan(mean.value)]
+        return min(defined, key=lambda pair: pair[1].value, default=None)
 
     def failures(self) -> list[Record]:
         """Return one record of every failed fit."""

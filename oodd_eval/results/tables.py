@@ -154,7 +154,7 @@ class Tables:
         )
         table = self.table(f"{title[0].upper()}{title[1:]} (%)", [*first, *alarms], note)
         if len(environments) > 1:
-            worst = [self._worst(entry, environments) for entry in self.order]
+            worst = [self._worst(entry) for entry in self.order]
             for row, text in zip((table.header, *table.rows), (WORST, *worst), strict=True):
                 row.insert(table.labels + 1, text)
         return replace(table, wrap=True)
@@ -162,16 +162,10 @@ class Tables:
     def _of(self, anomaly: str) -> list[Record]:
         return [r for r in self.board.records if r.anomaly == anomaly]
 
-    def _worst(self, entry: Setting, environments: Sequence[str]) -> str:
+    def _worst(self, entry: Setting) -> str:
         """Return the environment in which a row's mean is lowest, and that mean."""
-        means = [
-            (e, self.board.of(entry, Column(self.board.ranking, "", [e]))) for e in environments
-        ]
-        defined = [(e, mean) for e, mean in means if not math.isnan(mean.value)]
-        if not defined:
-            return ""
-        environment, mean = min(defined, key=lambda pair: pair[1].value)
-        return f"{environment} {show_value(mean, self.board.ranking)}"
+        worst = self.board.worst(entry)
+        return f"{worst[0]} {show_value(worst[1], self.board.ranking)}" if worst else ""
 
     def _promise(self, columns: Iterable[Column]) -> str:
         """Return what a table of guaranteed alarms promises, and which level stands for another."""
@@ -555,7 +549,7 @@ def findings(board: Board) -> list[str]:
             for entry in board.entries:
                 same_kind = board.is_trivial(entry) or simple.detector == entry.detector
                 if simple.horizon == entry.horizon and not same_kind:
-                    value, lower, _ = board.compare(simple, entry, info.name)
+                    value, lower = board.compare(simple, entry, info.name)
                     if value > lower:
                         below.append(f"{entry} ({info.text(lower)} against {info.text(value)})")
             if below:
@@ -580,7 +574,7 @@ def phase_findings(board: Board) -> list[str]:
             continue
         part, listed = Board(records), []
         for entry in (e for e in part.entries if e.detector not in _SENSELESS):
-            phase, value, _ = part.compare(clock, entry, info.name)
+            phase, value = part.compare(clock, entry, info.name)
             mean = part.of(entry, Column(info.name, intervals=True))
             if phase >= value and not mean.low <= 0.5 <= mean.high:
                 listed.append(f"{entry} ({info.text(value)} against {info.text(phase)})")

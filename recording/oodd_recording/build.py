@@ -66,7 +66,7 @@ MOST_CANDIDATES: Final = 10  # seeds looked at per test trajectory for twins tha
 PACKAGES: Final = ("oodd-eval", "numpy", "gymnasium")
 """Distributions whose versions a manifest has, besides those of the simulators."""
 
-Progress = Callable[[int, int, str], None]
+Progress = Callable[[int, int, str], object]
 """Called with chunks done, chunks in all, and the environment and part of the last one."""
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Final
+from typing import Any, Final
 
 import click
 
@@ -10,7 +10,7 @@ from oodd_eval.cli import DIRECTORY, FILE, OUTPUT_DIRECTORY, Options, command, s
 from oodd_eval.cli.console import make_console
 from oodd_eval.data.files import only_writer, temporary_directory
 from oodd_leaderboard import submit as submission
-from oodd_leaderboard.entry import ENTRY
+from oodd_leaderboard.entry import ENTRY, Entry
 from oodd_leaderboard.pages import PARTS, STALE, differences, read_leaderboard, stale
 from oodd_leaderboard.pages import build as build_board
 
@@ -31,7 +31,8 @@ def build(options: Options) -> int:
     The exit code is 1 when --check finds a difference, and 5 when there is nothing to show.
     """
     output = options.output or options.directory
-    with part_shown(quiet=options.verbosity < 0) as show, temporary_directory() as fresh:
+    quiet = options.verbosity < 0
+    with progress_shown("leaderboard", quiet=quiet) as show, temporary_directory() as fresh:
         show("records")
         leaderboard = read_leaderboard(options.directory)
         if not (leaderboard.seasons or leaderboard.reported):
@@ -54,14 +55,14 @@ def build(options: Options) -> int:
 
 
 @contextmanager
-def part_shown(*, quiet: bool) -> Iterator[Callable[[str], object]]:
-    """Show the part of a build that is being made; nothing where standard error is no terminal."""
+def progress_shown(doing: str, *, quiet: bool) -> Iterator[Callable[[str], object]]:
+    """Show how far something is that is being done; nothing where standard error is no terminal."""
     console = make_console(quiet=quiet, stderr=True)
     if quiet or not console.is_terminal:
         yield str
         return
-    with console.status("leaderboard") as status:
-        yield lambda part: status.update(f"leaderboard: {part}")
+    with console.status(doing) as status:
+        yield lambda part: status.update(f"{doing}: {part}")
 
 
 @command("leaderboard submit oodd-results --detector mine --wheel dist/oodd_mine-0.1.0.whl")
@@ -91,11 +92,13 @@ def submit(options: Options) -> int:
     Its records are shown as reported rows. A season ranks its own.
     """
     names = ("name", "requirement", "sha256", "authors", "paper", "url", "licence")
-    texts = {name: " ".join((getattr(options, name) or "").split()) for name in names}
-    statement = submission.Statement(
-        **texts, wheel=options.wheel, year=options.year, variant=options.variant
+    texts: dict[str, Any] = {
+        name: " ".join((getattr(options, name) or "").split()) for name in names
+    }
+    stated = Entry(**texts, year=options.year, variant=options.variant)
+    path = submission.submit(
+        options.directory, options.detector, options.entries, stated, options.wheel
     )
-    path = submission.submit(options.directory, options.detector, options.entries, statement)
     if options.verbosity >= 0:
         console = make_console()
         console.print((path / ENTRY).read_text(encoding="utf-8"), markup=False, end="")

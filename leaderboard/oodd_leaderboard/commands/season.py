@@ -3,12 +3,12 @@
 import re
 import secrets
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
 import click
-from oodd_recording.build import Progress, build_split
+from oodd_recording.build import build_split
 from oodd_recording.season import SEASON_ENVIRONMENTS, SeasonSizes, season_definition
 from rich.console import Console
 
@@ -35,8 +35,9 @@ from oodd_eval.results.record import Record
 from oodd_eval.scoring.display import Display
 from oodd_eval.scoring.executors import RunSettings, check_executor
 from oodd_leaderboard import season as running
+from oodd_leaderboard.commands.entries import progress_shown
 from oodd_leaderboard.entry import FORMS, read_entries
-from oodd_leaderboard.pages import PAGE, SITE, build_season
+from oodd_leaderboard.pages import PAGE, SITE, build, read_leaderboard
 from oodd_leaderboard.sandbox.launcher import make_sandbox
 from oodd_leaderboard.season_files import SEASON, SPLIT, read_season, row_path
 
@@ -98,14 +99,14 @@ def season(options: Options) -> int:
         definition = season_definition(bits, environments, sizes)
         trial = sizes != SeasonSizes() or len(environments) < len(SEASON_ENVIRONMENTS)
         begun = running.begin(directory, definition, bits, trial=trial, entries=entries)
-        with _recording_shown(options) as progress:
+        with progress_shown("recording the split", quiet=options.verbosity < 0) as show:
             build_split(
                 definition,
                 directory / SPLIT,
                 bits=bits,
                 environments=environments,
                 jobs=options.jobs,
-                progress=progress,
+                progress=lambda done, total, part: show(f"{done}/{total}, {part}"),
             )
         begun = running.noted_split(begun, directory)
         split = f"split {begun.split.name}, digest {begun.split.digest}"
@@ -145,8 +146,8 @@ def _run(runner: running.SeasonRunner, console: Console, *, quiet: bool) -> int:
     if lines := runner.season.missing(records):
         return say(f"the season is not whole: {'; '.join(lines)}", 1)
     runner.season = running.end(runner.season, runner.directory)
-    with console.status("page and site") if console.is_terminal else nullcontext():
-        build_season(runner.directory)
+    with progress_shown("board", quiet=quiet) as show:
+        build(read_leaderboard(runner.directory), runner.directory, on_part=show)
     page, site = runner.directory / PAGE, runner.directory / SITE / "index.html"
     console.print(f"season {runner.season.name} is whole: page {page}, site {site}")
     return int(not all(record.ok for record in records))
@@ -160,17 +161,6 @@ def _outcome(records: Sequence[Record]) -> str:
         first = failed[0]
         text += f", {len(failed)} failed ({first.environment}: {first.status}: {first.reason})"
     return text
-
-
-@contextmanager
-def _recording_shown(options: Options) -> Iterator[Progress]:
-    """Show on a terminal how far the recording of the split is."""
-    console = make_console(quiet=options.verbosity < 0, stderr=True)
-    if not console.is_terminal:
-        yield lambda _done, _total, _part: None
-        return
-    with console.status("recording the split") as status:
-        yield lambda done, total, part: status.update(f"recording {done}/{total}: {part}")
 
 
 @contextmanager

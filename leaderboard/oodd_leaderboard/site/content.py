@@ -344,12 +344,9 @@ def _difference(test: PairedDifference | None) -> Json | None:
 
 def _worst(board: Board, row: Setting) -> Json | None:
     """Return the environment with the least mean of the metric that ranks, and that mean."""
-    every = board.anomalies
-    means = {e: board.mean(row, [e], every, board.ranking).value for e in board.environments}
-    if not (defined := [e for e in means if not math.isnan(means[e])]):
+    if not (worst := board.worst(row)):
         return None
-    worst = min(defined, key=means.__getitem__)
-    return {"value": _short(means[worst]), "environment": worst}
+    return {"value": _short(worst[1].value), "environment": worst[0]}
 
 
 def _summaries(
