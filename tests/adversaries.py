@@ -7,7 +7,6 @@ twins (module ``oodd_adversaries_table``). `sweep` removes what plain runs leave
 """
 
 import array
-import builtins
 import contextlib
 import gc
 import itertools
@@ -186,27 +185,11 @@ class CompanyInBatch(Company):
         return [self.score(x) for x in trajectories]
 
 
-class CompanyOfClass(Company):
-    """The same in an attribute of the class."""
-
-    shared = bytearray(CELLS)
-
-    def memory(self):
-        return type(self).shared
-
-
 class CompanyOfModule(Company):
     """The same in a global of the module."""
 
     def memory(self):
         return MODULE_MEMORY
-
-
-class CompanyOfInterpreter(Company):
-    """The same in the module `builtins`."""
-
-    def memory(self):
-        return builtins.__dict__.setdefault("_sly", bytearray(CELLS))
 
 
 class CompanyOfEnvironment(Company):
@@ -545,20 +528,6 @@ class AnswersEarly(Honest):
 # Blind ones: they know no dynamics, and may separate nothing.
 
 
-class Timer(Honest):
-    """0 before a fixed time, 1 from then on."""
-
-    def bent(self, row, score):
-        return float(self.now_ > 60)
-
-
-class Survival(Honest):
-    """For how long the episode has lasted, in lengths of a typical one."""
-
-    def bent(self, row, score):
-        return self.now_ / self.longest_
-
-
 class Novelty(Honest):
     """Number of discrete sensors that show a value that they never had in training."""
 
@@ -590,9 +559,7 @@ KINDS = {
     "company": {
         "company": Company,
         "company-batch": CompanyInBatch,
-        "company-class": CompanyOfClass,
         "company-module": CompanyOfModule,
-        "company-interpreter": CompanyOfInterpreter,
         "company-environment": CompanyOfEnvironment,
         "company-home": CompanyOfHome,
         "company-fit-map": CompanyOfFitMap,
@@ -606,13 +573,7 @@ KINDS = {
     "burglar": {"burglar": Burglar, "memorised": Memorised},
     "state": {"mapped-state": MappedState},
     "worker": {"reads-ahead": ReadsAhead, "takes-over": TakesOver, "answers-early": AnswersEarly},
-    "blind": {
-        "comb": Comb,
-        "timer": Timer,
-        "clock": Clock,
-        "novelty": Novelty,
-        "survival": Survival,
-    },
+    "blind": {"comb": Comb, "clock": Clock, "novelty": Novelty},
 }
 """All adversaries by kind and name."""
 

@@ -55,15 +55,8 @@ IMPORTED = {
     "deep": (ANSWERS + "x = []\nfor _ in range(500): x = [x]\nanswer(specs=x)", ""),
     "long numbers": (ANSWERS + "answer(specs=[10**4000])", ""),
     "no specs": (ANSWERS + "describe._answer = lambda *_: {}", "wrong form"),
-    "unknown field": (ANSWERS + "spec(origin='oodd-eval')", "wrong form"),
     "a factory": (ANSWERS + "spec(factory='os.system')", "wrong form"),
-    "a name": (ANSWERS + "spec(name='../x')", "name of a DetectorSpec is"),
     "a type": (ANSWERS + "spec(parameters={'a': {'types': ['os']}})", "wrong form"),
-    "a dunder": (
-        ANSWERS + "spec(parameters={'__class__': {'types': ['int'], 'items': [], 'default': 1,"
-        "'low': None, 'above': None, 'high': None, 'choices': [], 'decides': 'fit', 'help': ''}})",
-        "ASCII name",
-    ),
     "many parameters": (ANSWERS + "spec(parameters={str(i): {} for i in range(999)})", "999"),
 }  # fmt: skip
 

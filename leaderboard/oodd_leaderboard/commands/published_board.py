@@ -33,6 +33,7 @@ from oodd_leaderboard.published import (
     read_published,
 )
 from oodd_leaderboard.reported import REPORTED
+from oodd_leaderboard.standings import OrderedBoard
 
 NEARBY: Final = 3
 """Rows above and below those of a run that `place` prints."""
@@ -56,6 +57,7 @@ def show(options: Options) -> int:
 
     They are installed with the package.
     """
+    _refuse_both(options)
     published = read_published()
     if options.split:
         names = {board.records[0].split for board in published}
@@ -63,7 +65,6 @@ def show(options: Options) -> int:
         published = [b for b in published if b.records[0].split == options.split]
     elif published and published[0].season:
         published = published[:1]
-    output = _Output(options)
     for board in published:
         ranks = board.ranks()
         notes = [EQUAL_NOTE if board.season else REPORTED, *unranked(ranks)]
@@ -71,9 +72,9 @@ def show(options: Options) -> int:
             board.title,
             facts=first_rows(ranks),
             tables=[table for table in [board_table(ranks)] if table],
-            notes=[] if output.quiet else notes,
+            notes=[] if options.verbosity < 0 else notes,
         )
-        output.print(section, standings_csv(ranks) if output.csv else "")
+        _print(section, ranks, options)
     return 0
 
 
@@ -87,23 +88,24 @@ def place_run(options: Options) -> int:
 
     The exit code is 4 when nothing of the run can be compared with a board.
     """
-    output = _Output(options)
-    if options.everything and (output.csv or output.quiet):
+    _refuse_both(options)
+    quiet = options.verbosity < 0
+    if options.everything and (options.csv or quiet):
         raise UsageError("--all is for the tables, which --csv and -q do not print: leave out one")
     published = read_published()
     runs = boards(_read(options.directory, options.detector))
     compared_with = [board_of(run.records, published) for run in runs]
     for run, board in zip(runs, compared_with, strict=True):
         placed = placement(run.records, board)
-        table = None if output.quiet else board_table(placed.ranks, placed.rows)
+        table = None if quiet else board_table(placed.ranks, placed.rows)
         section = Section(
             f"Your rows beside: {board.title}",
             facts=_sentences(placed),
             tables=[table if options.everything else _nearby(table)] if table else [],
-            notes=[] if output.quiet else [EQUAL_NOTE if board.season else REPORTED],
+            notes=[] if quiet else [EQUAL_NOTE if board.season else REPORTED],
         )
-        csv = output.csv and not output.quiet
-        output.print(section, standings_csv(placed.ranks) if csv else "")
+        if not (options.csv and quiet):
+            _print(section, placed.ranks, options)
     return 0
 
 
@@ -162,24 +164,23 @@ def _sentences(placed: Placement) -> list[str]:
     return lines
 
 
-class _Output:
-    """Prints sections as the options ask: for a terminal, as Markdown, or as CSV."""
+def _refuse_both(options: Options) -> None:
+    if options.markdown and options.csv:
+        raise UsageError("--markdown and --csv are two formats: leave out one")
 
-    def __init__(self, options: Options) -> None:
-        if options.markdown and options.csv:
-            raise UsageError("--markdown and --csv are two formats: leave out one")
-        self.markdown, self.csv, self.quiet = options.markdown, options.csv, options.verbosity < 0
-        self._console = make_console()
 
-    def print(self, section: Section, csv: str = "") -> None:
-        if self.csv:
-            print(csv, end="")
-        elif self.markdown:
-            print(markdown_section(section))
-        else:
-            self._console.print(section.title if section.facts else f"{section.title}\n")
-            for sentence in section.facts:
-                print_prose(sentence, self._console)
-            if section.facts and section.tables:
-                self._console.print("")
-            print_sections([section], self._console)
+def _print(section: Section, ranks: OrderedBoard, options: Options) -> None:
+    """Print a board as the options ask: for a terminal, as Markdown, or as CSV."""
+    if options.csv:
+        print(standings_csv(ranks), end="")
+        return
+    if options.markdown:
+        print(markdown_section(section))
+        return
+    console = make_console()
+    console.print(section.title if section.facts else f"{section.title}\n")
+    for sentence in section.facts:
+        print_prose(sentence, console)
+    if section.facts and section.tables:
+        console.print("")
+    print_sections([section], console)
