@@ -139,7 +139,8 @@ class LeaderboardSection:
     @property
     def date(self) -> str:
         """The day of its latest record; empty where none says it."""
-        return max((day_of(record) for record in self.ranks.board.records), default="")
+        times = (str(r.provenance.get("time", ""))[:10] for r in self.ranks.board.records)
+        return max(filter(re.compile(r"\d{4}-\d\d-\d\d").fullmatch, times), default="")
 
     @property
     def order(self) -> tuple[int, str, int, int, str]:
@@ -150,12 +151,6 @@ class LeaderboardSection:
         # Whole splits before limited ones, the newest protocol first.
         limit = -1 if board.limit is None else int(board.limit)
         return position, name, limit, -board.protocol, board.digest
-
-
-def day_of(record: Record) -> str:
-    """Return the day on which a record was made; empty where it does not say it."""
-    day = str(record.provenance.get("time", ""))[:10]
-    return day if re.fullmatch(r"\d{4}-\d\d-\d\d", day) else ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -108,7 +108,10 @@ def differences(
     count = resamples or max(MIN_RESAMPLES, RESAMPLES_PER_PAIR * len(pairs))
     influences = {name: _influences(rows[name]) for name in dict.fromkeys(itertools.chain(*pairs))}
     sizes = {(key, z.size) for row in influences.values() for key, z in row.of_tests.items()}
-    drawn = {key: _draws(key, n, count) for key, n in sorted(sizes)}
+    drawn = {  # how often each of n is drawn: shape (n, R)
+        key: np.ascontiguousarray(bootstrap_weights(n, key=key, resamples=count).T)
+        for key, n in sorted(sizes)
+    }
     tests = [_Test.of(influences[a], influences[b], drawn, count) for a, b in pairs]
     p = np.array([test.p for test in tests])
     corrected = holm(p)
@@ -207,11 +210,6 @@ def _minus(first: Mapping[str, Floats], second: Mapping[str, Floats], key: str) 
     return np.where(np.abs(shift) > NOISE, shift, 0.0)
 
 
-def _draws(key: str, n: int, resamples: int) -> Floats:
-    """Return how often each of n is drawn: shape (n, R)."""
-    return np.ascontiguousarray(bootstrap_weights(n, key=key, resamples=resamples).T)
-
-
 def holm(p: Floats) -> Floats:
     """Return p-values after Holm's step-down correction for the number of them (Holm, 1979).
 
@@ -271,7 +269,8 @@ def _influences(row: Row) -> _Influences:
     of_calibrations: dict[str, Floats] = {}
     used = set()  # alarms on nominal episodes have no terms of others
     for cell, terms in ordered:
-        influence = _influence(terms)
+        residuals = terms.numerator - terms.value * terms.denominator
+        influence = residuals * len(residuals) / float(terms.denominator.sum())
         for sample, of_sample in _samples(cell, terms):
             part = influence[of_sample]
             parts.setdefault(sample, []).append(part * (len(part) / len(influence)))
@@ -283,8 +282,3 @@ def _influences(row: Row) -> _Influences:
     of_tests = {sample: np.sum(parts[sample], axis=0) / len(ordered) for sample in sorted(used)}
     mean = float(np.mean([terms.value for _, terms in ordered]))
     return _Influences(mean, of_tests, of_calibrations)
-
-
-def _influence(contribution: Contribution) -> Floats:
-    residuals = contribution.numerator - contribution.value * contribution.denominator
-    return residuals * len(residuals) / float(contribution.denominator.sum())

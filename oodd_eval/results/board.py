@@ -275,15 +275,10 @@ def level_of(records: Sequence[Record]) -> str:
     """
     if records[0].paired:
         return HEADLINE
-    usual = usual_levels()
+    weaker = (suffix for suffix, share in LEVELS.items() if share >= LEVELS[HEADLINE])
+    usual = sorted(weaker, key=LEVELS.__getitem__)  # the strictest first
     counts = [sum(f"false_episodes_{s}" in r.metrics for r in records) for s in usual]
     return usual[counts.index(max(counts))]
-
-
-def usual_levels() -> list[str]:
-    """Return the suffixes of the headline's level and of weaker ones, the strictest first."""
-    weaker = (suffix for suffix, share in LEVELS.items() if share >= LEVELS[HEADLINE])
-    return sorted(weaker, key=LEVELS.__getitem__)
 
 
 def expected_cells(records: Sequence[Record]) -> set[Position]:
@@ -298,16 +293,11 @@ def expected_cells(records: Sequence[Record]) -> set[Position]:
     conditions = Conditions.of(records[0])
     name = conditions.split
     if published_digests().get(name) == conditions.split_digest:
-        return defined_cells(name)
+        suite, cap = SPLITS[name].suite, SPLITS[name].episode_cap
+        return {(e, str(c)) for e in ENVIRONMENTS for c in conditions_of(suite, e, cap)}
     rows = grouped(records, lambda r: r.setting).values()
     counts = Counter(cell for row in rows for cell in {r.position for r in row})
     return {cell for cell, n in counts.items() if 2 * n >= len(rows)}
-
-
-def defined_cells(split: str) -> set[Position]:
-    """Return the environments and conditions of a published split, or of one that will be."""
-    suite, cap = SPLITS[split].suite, SPLITS[split].episode_cap
-    return {(e, str(c)) for e in ENVIRONMENTS for c in conditions_of(suite, e, cap)}
 
 
 def cells_with(metric: str, records: Iterable[Record]) -> set[Position]:

@@ -17,9 +17,10 @@ import pytest
 from helpers_fuzz import ANY, damaged
 from helpers_split import make_split
 from hypothesis import strategies as st
+from oodd_leaderboard.entry import Entry
 from oodd_leaderboard.reported import by_detector, entries_of, read_reported, sections
 from oodd_leaderboard.site.content import site_data
-from oodd_leaderboard.submit import Statement, submit
+from oodd_leaderboard.submit import submit
 
 from oodd_eval import evaluate, load_split
 from oodd_eval.data.bounded import STATE as STATE_BOUNDS
@@ -94,7 +95,7 @@ def results(tmp_path_factory):
     home = tmp_path_factory.mktemp("results")
     split = make_split(home / "split", calibration=20)
     evaluate("persistence", split, output=home / "out")
-    return submit(home / "out", "persistence", home / "entries", Statement())
+    return submit(home / "out", "persistence", home / "entries", Entry(""))
 
 
 @pytest.mark.parametrize("name", ["entry.toml", "records.jsonl", "curves.json"])
