@@ -6,8 +6,6 @@ import adversaries
 import numpy as np
 import pytest
 from helpers_plugins import install_adversaries
-from hypothesis import given
-from hypothesis import strategies as st
 
 from oodd_eval import evaluate, load_split
 from oodd_eval.metrics.auc import auc
@@ -79,16 +77,6 @@ def test_the_company_would_win_in_one_batch():
             a, b = together[k * n + i], twins[i]
             areas.append(auc(a[effect : len(b)], b[effect : len(a)]))
     assert np.nanmean(areas) > 0.95
-
-
-@given(st.integers(0, 50), st.integers(1, 20), st.integers(1, 9))
-def test_mixed_groups_miss_nothing_and_hold_no_two_episodes_of_a_seed(calibration, seeds, tests):
-    sizes = {"calibration": calibration, **{f"test/{k}": seeds for k in range(tests)}}
-    places = Counter(place for group in mixed(sizes) for place in group)
-    assert places == Counter((part, i) for part, n in sizes.items() for i in range(n))
-    for group in mixed(sizes):
-        test = [i for part, i in group if part != "calibration"]
-        assert len(test) == len(set(test))
 
 
 def test_the_number_of_a_mixed_group_says_nothing_of_its_episodes():
