@@ -124,8 +124,8 @@ def _requirement(entry: Entry, directory: Path, work: Path) -> str:
 
 def beside(entry: Entry, directory: Path) -> Path:
     """Return the directory that an entry's file is in: that of the entries, or one in it."""
-    own = directory / entry.name
-    return own if (own / ENTRY).is_file() else directory
+    inside = directory / entry.name
+    return inside if (inside / ENTRY).is_file() else directory
 
 
 def _check_digest(entry: Entry, digest: str) -> None:

@@ -271,8 +271,8 @@ def first_rows(ranks: OrderedBoard) -> list[str]:
     if not rest:
         return [f"{text} There is no second ranked row."]
     test = ranks.first[rest[0].entry]
-    told = "told" if test.told_apart else "not told"
-    text += f" It is {told} from the second, {rest[0].entry}: the difference is "
+    verdict = "told" if test.told_apart else "not told"
+    text += f" It is {verdict} from the second, {rest[0].entry}: the difference is "
     lines = [f"{text}{difference_text(test)}."]
     if (band := sum(row.band for row in places)) > 2:
         lines.append(f"The first band has {band} rows: none of them is told from the first.")

@@ -69,8 +69,8 @@ def links(leaderboard: Path) -> dict[str, str]:
     """Return where the links of a site lead, by name; `leaderboard` is what its directory is in."""
     if not (base := project(leaderboard / "site")):
         return _WITHOUT
-    found = {name: base + path for name, (_, path) in LINKS.items()}
-    return found | (dict.fromkeys(("home", "source"), address) if (address := repository()) else {})
+    addresses = {name: base + path for name, (_, path) in LINKS.items()}
+    return addresses | (dict.fromkeys(("home", "source"), address) if (address := repository()) else {})
 
 
 def files(
