@@ -70,7 +70,9 @@ def links(leaderboard: Path) -> dict[str, str]:
     if not (base := project(leaderboard / "site")):
         return _WITHOUT
     addresses = {name: base + path for name, (_, path) in LINKS.items()}
-    return addresses | (dict.fromkeys(("home", "source"), address) if (address := repository()) else {})
+    return addresses | (
+        dict.fromkeys(("home", "source"), address) if (address := repository()) else {}
+    )
 
 
 def files(
