@@ -91,8 +91,8 @@ def read_strange_records(directory: Path) -> list[Record]:
     for number, line in enumerate(lines, start=1):
         record = Record.from_json(line, f"{path}:{number}")
         check_record(record, f"{path}:{number}")
-        known = record.paired and "auc_before" not in record.metrics
-        if known and (problem := early_difference(record)):
+        equal_before = record.paired and "auc_before" not in record.metrics
+        if equal_before and (problem := early_difference(record)):
             raise ResultsError(f"{path}:{number}: {problem}")
         records.append(record)
     return records

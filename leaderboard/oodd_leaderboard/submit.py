@@ -162,7 +162,7 @@ def _toml(name: str, value: Any) -> str:
     """Return a value in TOML, which has JSON's texts, numbers, truth values and lists."""
     if value is None or isinstance(value, dict):
         raise UsageError(f"parameter {name!r} is {value!r}, which an entry cannot hold")
-    return json.dumps(value)
+    return json.dumps(value, ensure_ascii=False)
 
 
 def _add_curves(records: Sequence[Record], source: ResultsDirectory, target: Path) -> None:

@@ -321,13 +321,13 @@ def _row(
         ],
         "means": _summaries(board, standing, names, filtered, intervals),
     }
-    whole = [of_cell if all(r.ok for r in of_cell) else [] for of_cell in by_cell]
+    complete_cells = [of_cell if all(r.ok for r in of_cell) else [] for of_cell in by_cell]
     part = {
         "version": records[0].detector_version,
         "parameters": records[0].parameters,
         "entry": _fields(entry, *ENTRY_FIELDS)
         | {"requirement": entry.wheel or entry.requirement, "reported": source and source.name},
-        "values": [[_mean(of_cell, name) for of_cell in whole] for name in names],
+        "values": [[_mean(of_cell, name) for of_cell in complete_cells] for name in names],
         "intervals": intervals,
         "curves": _curves(units.get(source.name, []) if source else [], records),
     }

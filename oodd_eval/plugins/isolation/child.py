@@ -72,10 +72,10 @@ class Launcher(Protocol):
 
     @property
     def elsewhere(self) -> Mapping[str, Any]:
-        """What another machine makes an equal one of, in values that JSON knows.
+        """Facts in JSON's values from which another machine makes an equal launcher.
 
-        ``maker`` is a function as ``module:name``. With the other ones, and ``memory``, it returns
-        a launcher and the plug-ins there.
+        ``maker`` names a function as ``module:name``. Called with the other facts and ``memory``,
+        it returns a launcher and the plug-ins there.
         """
 
     def wrap(self, command: Sequence[str]) -> tuple[list[str], list[int]]:
