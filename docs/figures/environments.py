@@ -130,7 +130,7 @@ def _worlds(pictures: Container[str]) -> str:
         (
             f"[{s.name}]({NAME}/{s.name}.md)",
             _image(f"{s.name}.svg", f"{s.title}: a drawing", pictures),
-            sum(sensor.role == "measured" for sensor in s.sensors),
+            sum(sensor.measured for sensor in s.sensors),
             len(s.actions),
         )
         for s in map(environment_spec, WORLDS)

@@ -1,7 +1,7 @@
 """Detectors of watchdogs: made by name or passed in, fed row by row even if they do not stream."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Self
@@ -53,8 +53,12 @@ class DetectorHandle:
         horizon: int,
         parameters: Mapping[str, Any],
         baseline: int = 0,
+        roles: Sequence[str] = (),
     ) -> Self:
-        """Make a detector of a name or class, or take an instance, for so many baseline rows."""
+        """Make a detector of a name or class, or take an instance.
+
+        `baseline` rows and the sensors' `roles` are handed to one that declares them.
+        """
         seed = read("seed", partial(whole_number, least=0), seed)
         horizon = read("horizon", partial(whole_number, least=1), horizon)
         kind = next((kind for kind in STATISTICS if kind == statistic), None)
@@ -73,6 +77,7 @@ class DetectorHandle:
                 horizon=horizon,
                 parameters=parameters,
                 baseline=baseline if adapts else 0,
+                roles=roles if spec.roles else (),
             )
             kind, name, actions = kind or spec.alarm, spec.name, spec.inputs != "observations"
         elif isinstance(detector, type) or not isinstance(detector, Detector):
@@ -80,7 +85,7 @@ class DetectorHandle:
             detector = make_detector(factory, seed=seed, horizon=horizon, parameters=parameters)
         state: dict[str, Any] = {"name": name, "statistic": kind or "cusum"}
         state |= {"seed": seed, "horizon": horizon}
-        state |= {"parameters": dict(parameters), "baseline": baseline}
+        state |= {"parameters": dict(parameters), "baseline": baseline, "roles": [*roles]}
         return cls(detector, kind or "cusum", actions, adapts, state)
 
     def visible(self, trajectory: Trajectory, base: Baseline | None = None) -> Trajectory:
@@ -113,6 +118,7 @@ class DetectorHandle:
             int(state["horizon"]),
             state["parameters"],
             int(state["baseline"]),
+            tuple(map(str, state.get("roles", ()))),
         )
 
 

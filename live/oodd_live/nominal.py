@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from oodd_eval.data.baseline import Baseline, check_baseline, episode_means
+from oodd_eval.data.facts import roles_of
 from oodd_eval.data.offsets import fit_offsets
 from oodd_eval.data.parts import EnvironmentData
 from oodd_eval.data.trajectory import Trajectory
@@ -33,11 +34,14 @@ class Nominal:
         Subtracted from observations in float64, (D,); 0 where nothing is.
     baseline
         Of the first rows of every episode; None where none are declared.
+    roles
+        Of the sensors, one each; empty where all are just measured.
     """
 
     sensors: list[str]
     offsets: Floats
     baseline: Baseline | None
+    roles: tuple[str, ...] = ()
 
     def judged(self, trajectory: Trajectory) -> Trajectory:
         """Return the rows of an episode that are judged, brought to training's."""
@@ -129,7 +133,7 @@ class NominalData:
         if rows:
             check_baseline(map(len, calibrating), rows, "calibration")
         base = Baseline.fit(training, rows) if rows else None
-        nominal = Nominal(names, subtracted, base)
+        nominal = Nominal(names, subtracted, base, roles_of(sensors or ()))
         return cls(training, calibrating, further, nominal, rate, recorded)
 
     def findings(self) -> list[PromiseFinding]:

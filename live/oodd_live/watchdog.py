@@ -147,7 +147,8 @@ class Watchdog:
         rate
             Observations in a second; needed for `hours`, and for time stamps in `update`.
         sensors
-            Names, or quantities with names as those of a split; default "sensor 0" and so on.
+            Names, or quantities with names and roles as those of a split; default "sensor 0" and so
+            on.
         baseline
             Number of rows at the start of every episode that are nominal. They are not judged, and
             each sensor's mean and spread over them are brought to training's.
@@ -184,7 +185,9 @@ class Watchdog:
         )
         nominal = data.nominal
         rows = nominal.baseline.rows if nominal.baseline else 0
-        handle = DetectorHandle.make(detector, statistic, seed, horizon, parameters or {}, rows)
+        handle = DetectorHandle.make(
+            detector, statistic, seed, horizon, parameters or {}, rows, nominal.roles
+        )
         settings = Settings(alpha, confidence, data.rate, latch, hold_off)
         if hours is not None:
             _check_hours(hours, settings)

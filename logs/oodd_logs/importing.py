@@ -401,7 +401,7 @@ class _Target:
         from_recipe = {key: getattr(recipe, key) for key in keys}
         facts = LogFacts(rate=source.rate, offsets=source.offsets, **from_recipe)
         environment_facts = layout.own_facts(
-            environment, discrete=source.discrete, groups=source.groups
+            environment, discrete=source.discrete, groups=source.groups, sensors=source.sensors
         )
         with only_writer(self.directory):
             # Another import may have added an environment meanwhile.

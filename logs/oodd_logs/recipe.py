@@ -9,10 +9,19 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, get_origin, get_type_hints
+from typing import Annotated, Any, Final, Literal, get_args, get_origin, get_type_hints
 
 from oodd_eval.data.bounded import read_toml
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, NAME_PATTERN, SPLITS, Group, Order
+from oodd_eval.data.facts import (
+    ANOMALIES,
+    ENVIRONMENTS,
+    GROUPS,
+    NAME_PATTERN,
+    SPLITS,
+    Group,
+    Order,
+    Role,
+)
 from oodd_eval.errors import UnknownNameError, UsageError
 from oodd_eval.names import check_known
 
@@ -129,6 +138,12 @@ def _scalars(key: str, value: Any) -> tuple[Any, ...]:
 
 def _conditions(key: str, value: Any) -> dict[str, tuple[Any, ...]]:
     return {name: _scalars(f"{key}.{name}", values) for name, values in _table(key, value).items()}
+
+
+def _roles(key: str, value: Any) -> dict[str, tuple[str, ...]]:
+    table = _table(key, value)
+    check_known(f"role of {key}", get_args(Role), *table)
+    return {role: _texts(f"{key}.{role}", globs) for role, globs in table.items()}
 
 
 def _discrete(key: str, value: Any) -> int | tuple[str, ...]:
@@ -287,6 +302,9 @@ class Recipe:
         Number of actions, or their names, where each action is a whole number from 0 on.
     angles
         Globs of sensors that are replaced by their sine and cosine.
+    roles
+        Globs of sensors by their role, see `oodd_eval.Quantity`. Sine and cosine of angles that are
+        replaced by them have these roles where the sensor's is ``"angle"``.
     constant
         What becomes of sensors that are constant in the training part: ``"keep"`` or ``"drop"``.
     missing
@@ -342,6 +360,7 @@ class Recipe:
     reward: Text = ""
     discrete: Annotated[int | tuple[str, ...], _discrete] = 0
     angles: Texts = ()
+    roles: Annotated[Mapping[str, tuple[str, ...]], _roles] = field(default_factory=dict)
     constant: Annotated[Literal["keep", "drop"], _choice("keep", "drop")] = "keep"
     missing: Annotated[Missing, _choice("refuse", "hold", "drop")] = "refuse"
     missing_rows: Whole = MISSING_ROWS

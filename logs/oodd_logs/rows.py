@@ -8,13 +8,13 @@ import math
 import tempfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Final
+from dataclasses import dataclass, field, replace
+from typing import Any, Final, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.data.facts import Quantity
+from oodd_eval.data.facts import Quantity, Role
 from oodd_eval.errors import OutputError, TrajectoryError, UsageError
 from oodd_eval.names import counted
 from oodd_logs.readers.cells import first_text, numbers
@@ -240,7 +240,7 @@ class Converter:
 
     def __init__(self, selection: Selection, recipe: Recipe, start: int = 0) -> None:
         self._inputs = len(selection.sensors), len(selection.actions)
-        quantities = [column.quantity for column in selection.sensors]
+        quantities = _with_roles([column.quantity for column in selection.sensors], recipe)
         names = [quantity.name for quantity in quantities]
         matches_any(recipe.angles, names, "sensor that is an angle")
         self._angles = [matches_any(recipe.angles, [name]) for name in names]
@@ -251,7 +251,13 @@ class Converter:
                     f"angles: {quantity.name!r} is in {quantity.unit}, expected rad or deg, as in "
                     f"sensors = ['{quantity.name}[rad]']"
                 )
-            parts = [Quantity(f"{function} {quantity.name}", "1") for function in ("sin", "cos")]
+            halves: dict[str, Role] = {"sin": "sine", "cos": "cosine"}
+            parts = [
+                Quantity(
+                    f"{f} {quantity.name}", "1", half if quantity.role == "angle" else quantity.role
+                )
+                for f, half in halves.items()
+            ]
             sensors += parts if is_angle else [quantity]
         self.sensors = tuple(sensors)
         self._scales = [np.pi / _FULL_TURN.get(q.unit, np.pi) for q in quantities]
@@ -309,6 +315,28 @@ class Converter:
                 f"{self._start} to {self._start + count - 1}"
             )
         return np.eye(count)[codes.astype(np.intp)]
+
+
+def _with_roles(sensors: Sequence[Quantity], recipe: Recipe) -> list[Quantity]:
+    """Return sensors with the roles that a recipe names, one each, angles in radians."""
+    names = [sensor.name for sensor in sensors]
+    named: dict[str, list[str]] = {}
+    for role, patterns in recipe.roles.items():
+        matches_any(patterns, names, f"sensor whose role is {role}")
+        for name in names:
+            if matches_any(patterns, [name]):
+                named.setdefault(name, []).append(role)
+    for sensor in sensors:
+        roles = named.get(sensor.name, [])
+        if len(roles) > 1:
+            raise UsageError(f"roles: {sensor.name!r} is {' and '.join(roles)}, expected one role")
+        turned = matches_any(recipe.angles, [sensor.name])
+        if roles == ["angle"] and sensor.unit in _FULL_TURN and not turned:
+            raise UsageError(
+                f"roles: the angle {sensor.name!r} is in {sensor.unit}, expected rad; list it "
+                "under angles, too, to replace it by sine and cosine"
+            )
+    return [replace(q, role=cast("Role", named.get(q.name, [q.role])[0])) for q in sensors]
 
 
 def _actions(columns: Sequence[ChosenColumn], recipe: Recipe) -> tuple[Quantity, ...]:

@@ -20,7 +20,21 @@ PROTOCOL: Final = 3
 
 Group = Literal["sensor", "dynamics"]
 
-Role = Literal["measured", "reference", "memory"]
+Role = Literal[
+    "measured",
+    "reference",
+    "memory",
+    "position",
+    "velocity",
+    "angle",
+    "cosine",
+    "sine",
+    "contact",
+    "setpoint",
+    "effort",
+]
+_UNMEASURED: Final = ("reference", "memory", "setpoint")
+_STORED: Final = ("reference", "memory")  # with names; manifests list all roles
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,8 +49,12 @@ class Quantity:
         What the number 1 means: ``"rad"``, or ``"10 rad/s"`` where the simulator divides angular
         speeds by ten, or ``"1"`` for a plain number.
     role
-        ``"measured"`` by a sensor, a ``"reference"`` that the controller follows, or its
-        ``"memory"``. Only what is measured has noise, or breaks.
+        ``"measured"`` by a sensor, a ``"reference"`` or ``"setpoint"`` that the controller
+        follows, or its ``"memory"``. Of what is measured it may also say more: ``"position"``,
+        ``"velocity"``, ``"angle"`` or its ``"cosine"`` and ``"sine"``, ``"contact"`` (0 without)
+        or ``"effort"``. Velocities are x, y, z of one frame, in one unit up to a factor a column;
+        one angle turns the plane of the first two, three are roll, pitch and yaw, and two are roll
+        and pitch of velocities that yaw turns no more. Only what is measured has noise, or breaks.
     noise
         Standard deviation of the sensor's noise in nominal operation, in `unit`.
     """
@@ -52,7 +70,7 @@ class Quantity:
                 f"{self.name!r} has role {self.role!r} and noise {self.noise!r}, expected one of "
                 f"{', '.join(get_args(Role))}, and a number from 0"
             )
-        if self.noise and self.role != "measured":
+        if self.noise and not self.measured:
             raise UsageError(f"{self.name!r} is not measured ({self.role}): expected no noise")
 
     @classmethod
@@ -71,11 +89,43 @@ class Quantity:
         return cls(**{field.name: row[field.name] for field in fields(cls) if field.name in row})
 
     @property
+    def measured(self) -> bool:
+        """True for what a sensor measures; False for references, set points and memory."""
+        return self.role not in _UNMEASURED
+
+    @property
     def row(self) -> dict[str, Any]:
-        """Name, unit, and the fields that differ from their default, as files store them."""
-        defaults = {"role": "measured", "noise": 0.0}
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {n: value for n, value in values.items() if value != defaults.get(n)}
+        """Name, unit, and what differs from its default, as files store them.
+
+        Of roles only references and memory are part of it, and so of digests.
+        """
+        row: dict[str, Any] = {"name": self.name, "unit": self.unit}
+        row |= {"role": self.role} if self.role in _STORED else {}
+        return row | ({"noise": self.noise} if self.noise else {})
+
+
+def roles_of(quantities: Iterable[object]) -> tuple[Role, ...]:
+    """Return the roles of sensors, one each, as detectors get them; none where no role says more.
+
+    Parameters
+    ----------
+    quantities
+        Sensors; names without a role count as measured.
+
+    Returns
+    -------
+    tuple of Role
+        Empty where all are just measured.
+
+    Examples
+    --------
+    >>> roles_of([Quantity("height", "m", "position"), Quantity("heat", "K")])
+    ('position', 'measured')
+    >>> roles_of([Quantity("heat", "K")])
+    ()
+    """
+    roles: tuple[Role, ...] = tuple(getattr(q, "role", "measured") for q in quantities)
+    return roles if {*roles} - {"measured"} else ()
 
 
 @dataclass(frozen=True, slots=True)

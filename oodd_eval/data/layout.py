@@ -15,7 +15,7 @@ import itertools
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, get_args
 
 import h5py
 import numpy as np
@@ -32,7 +32,9 @@ from oodd_eval.data.facts import (
     Group,
     LogFacts,
     Quantity,
+    Role,
     SplitDefinition,
+    roles_of,
 )
 from oodd_eval.data.files import Unfailing, replacing, write_text
 from oodd_eval.data.parts import CALIBRATION, NAMES, NOMINAL, TRAIN, TWINS, conditions_in
@@ -211,15 +213,44 @@ def environment_digest(entry: Mapping[str, Any]) -> str:
     return _canonical_digest(digests | {NAMES: names_digest(entry)} | custom)
 
 
-def own_facts(environment: str, *, discrete: bool, groups: Mapping[str, Group]) -> dict[str, Any]:
+def own_facts(
+    environment: str,
+    *,
+    discrete: bool,
+    groups: Mapping[str, Group],
+    sensors: Sequence[Quantity] = (),
+) -> dict[str, Any]:
     """Return what a manifest entry says of what is not among the benchmark's facts, if anything.
 
-    `groups` are those of all anomalies in the environment's file.
+    `groups` are those of all anomalies in the environment's file, `sensors` its sensors, whose
+    roles are no part of digests.
     """
     kinds = {kind: group for kind, group in groups.items() if kind not in ANOMALIES}
     if environment in ENVIRONMENTS and not kinds:
         return {}
-    return {"own": {"discrete": discrete, "anomalies": kinds}}
+    roles = {} if environment in ENVIRONMENTS else {"roles": [*roles_of(sensors)]}
+    return {"own": {"discrete": discrete, "anomalies": kinds}} | (
+        roles if any(roles.values()) else {}
+    )
+
+
+def roles_in(environment: str, entry: Mapping[str, Any]) -> tuple[Role, ...]:
+    """Return the roles of an environment's sensors from its manifest entry, see `roles_of`.
+
+    Of an environment of the benchmark they are those of its facts, where it has their sensors.
+    Raises `SplitError` where there are not as many as sensors.
+    """
+    sensors = tuple(map(Quantity.read, entry["sensors"]))
+    roles: tuple[Role, ...] = tuple(entry.get("roles", ()))
+    if roles and len(roles) != len(sensors):
+        raise SplitError(
+            f"the manifest has {len(roles)} roles of {environment}'s sensors, expected "
+            f"{len(sensors)}: build or import it again"
+        )
+    if not roles and environment in ENVIRONMENTS:
+        facts = ENVIRONMENTS[environment].sensors
+        roles = roles_of(facts) if [q.name for q in facts] == [q.name for q in sensors] else ()
+    return roles or roles_of(sensors)
 
 
 def discrete_actions(environment: str, entry: Mapping[str, Any]) -> bool:
@@ -374,7 +405,14 @@ def _manifest_schema() -> Any:
         citation=text,
     )
     logs["extra_behavior"] = "forbid"
-    optional_fields = {"own": custom, "strengths": strengths, "units": units, "logs": logs}
+    roles = core_schema.list_schema(core_schema.literal_schema([*get_args(Role)]))
+    optional_fields = {
+        "own": custom,
+        "roles": roles,
+        "strengths": strengths,
+        "units": units,
+        "logs": logs,
+    }
     for key, optional in optional_fields.items():
         environment["fields"][key] = core_schema.typed_dict_field(optional, required=False)
     schema = core_schema.literal_schema([SCHEMA, LOGS_SCHEMA])

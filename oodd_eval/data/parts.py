@@ -7,7 +7,8 @@ import contextlib
 import functools
 import itertools
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from oodd_eval.data.condition import NOMINAL as NOMINAL_TEST
 from oodd_eval.data.condition import Condition, in_suite_order
-from oodd_eval.data.facts import BRIEF_TAIL, FIRST_ONSET, LogFacts, Quantity
+from oodd_eval.data.facts import BRIEF_TAIL, FIRST_ONSET, LogFacts, Quantity, Role
 from oodd_eval.data.stored import StoredFile
 from oodd_eval.data.trajectory import Trajectory, TrajectorySequence
 from oodd_eval.errors import SplitError
@@ -259,7 +260,7 @@ class EnvironmentData:
         Anomalies of this split, with ``@`` and the strength where there are several, as in
         ``iid@kept99``.
     sensors, actions
-        Names and units of the columns of observations and actions.
+        Names and units of the columns of observations and actions, of sensors also their roles.
     discrete
         True when an action is a one-hot row.
     logs
@@ -275,6 +276,7 @@ class EnvironmentData:
         *,
         discrete: bool = False,
         logs: LogFacts | None = None,
+        roles: Sequence[Role] = (),
     ) -> None:
         self.id, self.digest, self.discrete, self.logs = environment, digest, discrete, logs
         self._file, self._parts = file, parts
@@ -285,6 +287,9 @@ class EnvironmentData:
             tuple(map(Quantity.read, map(json.loads, names[:])))
             for names in (parts[NAMES]["sensors"], parts[NAMES]["actions"])
         )
+        if roles:
+            pairs = zip(self.sensors, roles, strict=True)
+            self.sensors = tuple(replace(sensor, role=role) for sensor, role in pairs)
 
     @property
     def baseline(self) -> int:

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from oodd_eval.data import layout
 from oodd_eval.data.condition import NOMINAL, Condition, in_suite_order
-from oodd_eval.data.facts import ENVIRONMENTS, SPLITS, Group, in_order
+from oodd_eval.data.facts import ENVIRONMENTS, SPLITS, Group, Role, in_order
 from oodd_eval.data.layout import MANIFEST, GroupCheck
 from oodd_eval.data.parts import NAMES, TRAIN, TWINS, EnvironmentData, check_twins, conditions_in
 from oodd_eval.data.stored import StoredFile
@@ -298,6 +298,21 @@ class Split:
         facts = layout.log_facts(self.manifest["environments"][environment])
         return 0 if facts is None else facts.baseline
 
+    def roles(self, environment: str) -> tuple[Role, ...]:
+        """Return the roles of an environment's sensors, see `Quantity`.
+
+        Parameters
+        ----------
+        environment
+            One of `environments`.
+
+        Returns
+        -------
+        tuple of str
+            One a sensor; empty where all are just measured.
+        """
+        return layout.roles_in(environment, self.manifest["environments"][environment])
+
     def train_digest(self, environment: str) -> str:
         """Return the digest of an environment's training part: what a fit depends on.
 
@@ -348,7 +363,8 @@ class Split:
         entry = self.manifest["environments"][name]
         digest = layout.environment_digest(entry)
         discrete, logs = layout.discrete_actions(name, entry), layout.log_facts(entry)
-        return EnvironmentData(name, file, parts, digest, discrete=discrete, logs=logs)
+        roles = layout.roles_in(name, entry)
+        return EnvironmentData(name, file, parts, digest, discrete=discrete, logs=logs, roles=roles)
 
     @contextlib.contextmanager
     def opened(self) -> Iterator[Callable[[str], EnvironmentData]]:

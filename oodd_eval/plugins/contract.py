@@ -252,6 +252,9 @@ class DetectorSpec:
         ``baseline=B``, and it is handed whole episodes as they were recorded, whose first B scores
         count for nothing. Others are handed the rows behind them, brought to training's mean and
         spread (`oodd_eval.data.baseline`).
+    roles
+        Whether the factory is also called with the roles of the sensors, ``roles=(...)``, one of
+        `oodd_eval.Quantity`'s a sensor, where any of them says more than ``"measured"``.
     parameters
         A frozen dataclass whose fields are the parameters that ``--param`` may set, each declared
         with `oodd_eval.plugins.parameters.parameter`. None when there are none.
@@ -279,6 +282,7 @@ class DetectorSpec:
     training: Training = "nominal"
     alarm: Alarm = "cusum"
     adapts: Literal["", "baseline"] = ""
+    roles: bool = False
     parameters: type | None = None
     other_parameters: bool = False
     requires: tuple[str, ...] = ()
@@ -295,13 +299,16 @@ def make_detector(
     horizon: int,
     parameters: Mapping[str, Any],
     baseline: int = 0,
+    roles: Sequence[str] = (),
 ) -> Detector:
     """Return an unfitted detector; raise `ContractError` for anything without `fit` and `score`.
 
-    `baseline` is the number of baseline rows for one that adapts to them.
+    `baseline` is the number of baseline rows for one that adapts to them, `roles` are those of the
+    sensors for one that declares them.
     """
-    adapting = {"baseline": baseline} if baseline else {}
-    detector = factory(**accepted(factory, seed=seed, horizon=horizon), **adapting, **parameters)
+    declared: dict[str, Any] = {"baseline": baseline} if baseline else {}
+    declared |= {"roles": tuple(roles)} if roles else {}
+    detector = factory(**accepted(factory, seed=seed, horizon=horizon), **declared, **parameters)
     if not isinstance(detector, Detector):
         expected = "an object with the methods fit(nominal) and score(trajectory)"
         raise ContractError(f"the factory returned {type(detector).__name__}, expected {expected}")

@@ -154,7 +154,7 @@ FIELDS: Final[tuple[tuple[str, str, Callable[[Any], bool]], ...]] = (
     ("training", " or ".join(get_args(Training)), _one_of(*get_args(Training))),
     ("alarm", " or ".join(get_args(Alarm)), _one_of(*get_args(Alarm))),
     ("adapts", "'' or baseline", _one_of("", "baseline")),
-    ("deterministic other_parameters horizon_decides_fit", "True or False", _is_truth),
+    ("deterministic other_parameters horizon_decides_fit roles", "True or False", _is_truth),
     ("requires", "names of modules", _are_lines),
     ("version", "a version such as 1.2", _text("[A-Za-z0-9.+!_-]{0,64}")),
     ("parameters", "a dataclass with fields of ASCII names, or None", _declares),

@@ -38,7 +38,8 @@ class Unit:
     `parameters` are all that the factory gets, sorted by name; `recorded` are those that are part
     of the result, so not the device. `plugin` is empty for a factory of this process, which has no
     `source` (the digest of a plug-in's code) and no key of a stored fit; its scores are stored
-    under a key, but never taken from there by a later run.
+    under a key, but never taken from there by a later run. `roles` are those of the sensors for a
+    detector that declares them.
     """
 
     environment: str
@@ -54,6 +55,7 @@ class Unit:
     inputs: str = ""
     alarm: Alarm = "cusum"
     adapts: Literal["", "baseline"] = ""
+    roles: tuple[str, ...] = ()
     deterministic: bool = False
     training: Training = "nominal"
     scores_key: str = ""
@@ -254,6 +256,9 @@ def make_unit(
         "split_digest": split.digest,
         "limit": limit,
     }
+    roles = split.roles(environment) if spec.roles else ()
+    if roles:
+        identity["roles"] = roles
     # Some file systems take no colons, and some do not tell capitals.
     name = spec.name.lower().replace(":", "-")
     scores = f"{name}-{environment}-{_digest(identity | {'protocol': PROTOCOL})[:20]}"
@@ -286,6 +291,7 @@ def make_unit(
         inputs=spec.inputs,
         alarm=spec.alarm,
         adapts=spec.adapts,
+        roles=roles,
         deterministic=spec.deterministic,
         training=spec.training,
         scores_key=scores,

@@ -180,6 +180,7 @@ class GroupedScoring:
             "horizon": unit.setting.horizon,
             "parameters": dict(unit.parameters),
             "baseline": self._adapting,
+            "roles": unit.roles,
         }
         parts, again = (map(self._members, g) for g in (self._groups, self._explained))
         return run_isolated(
@@ -235,6 +236,7 @@ class GroupedScoring:
             horizon=unit.setting.horizon,
             parameters=unit.parameters,
             baseline=self._adapting,
+            roles=unit.roles,
         )
         contract.fit_detector(detector, [*self._train], self._progress)
         self._progress(1.0)

@@ -214,7 +214,9 @@ def _write(
             policy,
             sensors=info.sensors,
             actions=info.actions,
-            custom=layout.own_facts(environment, discrete=info.discrete, groups=kinds),
+            custom=layout.own_facts(
+                environment, discrete=info.discrete, groups=kinds, sensors=info.sensors
+            ),
         ) | _strengths(definition, environment)
 
 

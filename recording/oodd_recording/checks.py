@@ -270,10 +270,10 @@ def check_sensors(subject: Subject) -> None:
         record_attempt(subject.setup, subject.kind, twin, maker)
         named = watched[0].parameters.get("sensors", ())
         for i in sorted(watched[0].corrupted):
-            if columns[i].role != "measured":
+            if not columns[i].measured:
                 _fail(
                     f"with seed {twin.seed} it corrupts {columns[i].name!r} ({columns[i].role}), "
-                    "expected sensors whose role is measured"
+                    "expected sensors that are measured"
                 )
             if i not in named:
                 _fail(

@@ -174,7 +174,7 @@ def measure(environment: str, policy: Policy) -> None:
     episodes = [setup.record(EVALUATION_SEED + i).trajectory for i in range(MEASURED_EPISODES)]
     rows = np.concatenate([episode.observations for episode in episodes]).astype(np.float64)
     moves = (rows != np.median(rows, axis=0)).mean(axis=0) >= 0.01
-    measured = [sensor.role == "measured" for sensor in environment_spec(environment).sensors]
+    measured = [sensor.measured for sensor in environment_spec(environment).sensors]
     may_break = [
         i for i, x in enumerate(rows.T) if measured[i] and moves[i] and len(np.unique(x)) > 8
     ]
@@ -320,7 +320,7 @@ def _noise(setup: Setup, seed: int) -> Callable[[NDArray[np.float32]], NDArray[n
     sensors = environment_spec(setup.environment).sensors
     std = np.array([sensor.noise for sensor in sensors])
     if setup.noise:
-        measured = np.array([sensor.role == "measured" for sensor in sensors])
+        measured = np.array([sensor.measured for sensor in sensors])
         std = np.hypot(std, setup.noise * spread_of(setup.environment) * measured)
     if not std.any():
         return lambda row: row

@@ -167,10 +167,10 @@ def make_fault(kind: str, strength: float, simulator: Simulator, rng: np.random.
     fault: Fault = spec.make(float(strength), rng, simulator)
     fault.parameters["strength"] = float(strength)
     corrupted = [columns[i] for i in fault.parameters.get("sensors", ())]
-    if others := [f"{q.name} ({q.role})" for q in corrupted if q.role != "measured"]:
+    if others := [f"{q.name} ({q.role})" for q in corrupted if not q.measured]:
         raise SimulationError(
-            f"{kind} corrupts {', '.join(others)} in {simulator.environment}, expected sensors "
-            'whose role is "measured": no sensor can break that does not exist'
+            f"{kind} corrupts {', '.join(others)} in {simulator.environment}, expected "
+            "sensors that are measured: no sensor can break that does not exist"
         )
     return Scheduled(fault, spec) if spec.ramp or spec.lasts or spec.pulses else fault
 

@@ -91,7 +91,7 @@ def test_every_number_has_a_unit_and_a_source(world):
         assert fact.unit, fact.name
         assert fact.source.startswith(ASSUMED) or any(c.isupper() for c in fact.source), fact.name
     for sensor in facts.sensors:
-        assert (sensor.noise > 0) == (sensor.role == "measured"), sensor.name
+        assert (sensor.noise > 0) == sensor.measured, sensor.name
 
 
 # What a seed decides

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from oodd_eval.data.facts import Quantity
 from oodd_logs.episodes import EVERY, Episode, names_matching, read_every_episode
 from oodd_logs.inspection.draft import draft
 from oodd_logs.inspection.logs import inspect_logs, recognised
@@ -23,7 +24,7 @@ class RecordedLogs:
     episodes
         All of them, with their labels.
     sensors
-        Names of the columns.
+        Names, units and roles of the columns.
     baseline
         Rows at the start of every episode that are nominal.
     notes
@@ -31,7 +32,7 @@ class RecordedLogs:
     """
 
     episodes: list[Episode]
-    sensors: list[str]
+    sensors: list[Quantity]
     baseline: int
     notes: list[str]
 
@@ -82,8 +83,5 @@ def read_logs(
         root = root if listed else home
     with read_every_episode(recipe, root, files) as source:
         return RecordedLogs(
-            list(source.episodes(EVERY)),
-            [sensor.name for sensor in source.sensors],
-            recipe.baseline,
-            list(source.notes),
+            list(source.episodes(EVERY)), [*source.sensors], recipe.baseline, list(source.notes)
         )

@@ -20,6 +20,7 @@ from oodd_live.watchdog import Watchdog
 
 from oodd_eval.data.baseline import Baseline
 from oodd_eval.data.bounded import without_nan
+from oodd_eval.data.facts import roles_of
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import ContractError, OoddError, UnknownNameError, UsageError
 from oodd_eval.metrics.alarms import AlarmKind, GuaranteedAlarm
@@ -232,7 +233,7 @@ def scan_episodes(
         In recorded order: episodes as recipes read them, or arrays of shape (R, D) with NaN for
         what is missing. A single one is cut into windows.
     sensors
-        Names, or quantities with names; default "sensor 0" and so on.
+        Names, or quantities with names and roles; default "sensor 0" and so on.
     detector
         Name of an installed detector, a class or function that makes one, or an unfitted one.
     watchdog
@@ -276,7 +277,7 @@ def scan_episodes(
     widths = sorted({episode.observations.shape[1] for episode in recorded})
     if len(widths) != 1:
         raise UsageError(f"episodes have {widths} sensors, expected the same number in all")
-    names = sensor_names(sensors, widths[0])
+    names, roles = sensor_names(sensors, widths[0]), roles_of(sensors or ())
     recorded, notes = _cut(recorded, window)
     shortest = baseline + SHORTEST
     usable = [episode for episode in recorded if len(episode.observations) >= shortest]
@@ -297,7 +298,7 @@ def scan_episodes(
     cleaned, spread = clean(usable)
     faults = stream_faults(usable, cleaned, spread, names, fdr)
     defaults = _QUICK if detector == SCANNER else {}
-    fit = _Fit(detector, seed, horizon, {**defaults, **(parameters or {})}, baseline)
+    fit = _Fit(detector, seed, horizon, {**defaults, **(parameters or {})}, baseline, roles)
     handle = fit.handle()
     trajectories = [episode.trajectory for episode in cleaned]
     folds = [range(k, len(usable), FITS) for k in range(min(FITS, len(usable)))]
@@ -421,11 +422,12 @@ class _Fit:
     horizon: int
     parameters: Mapping[str, Any]
     baseline: int
+    roles: tuple[str, ...] = ()
 
     def handle(self) -> DetectorHandle:
         """Return a new detector."""
         return DetectorHandle.make(
-            self.detector, None, self.seed, self.horizon, self.parameters, self.baseline
+            self.detector, None, self.seed, self.horizon, self.parameters, self.baseline, self.roles
         )
 
     def judge(

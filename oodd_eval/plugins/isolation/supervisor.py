@@ -80,9 +80,10 @@ def run_isolated(
     explains is asked to explain the groups `explained` in the same way, last.
 
     The request names ``plugin`` and ``detector``, its ``parameters``, ``seed``, ``horizon`` and
-    perhaps ``baseline`` (see `make_detector`). `state` is that of an earlier fit, which replaces
-    fitting; with `keep`, the outcome has that of this one. `streamed` hands over one row of
-    each episode at a time, and waits for the scores before the next; then nothing is explained.
+    perhaps ``baseline`` and ``roles`` (see `make_detector`). `state` is that of an earlier fit,
+    which replaces fitting; with `keep`, the outcome has that of this one. `streamed` hands over one
+    row of each episode at a time, and waits for the scores before the next; then nothing is
+    explained.
     `progress` is called with the share of the fit that is done, as far as the detector tells, and
     with 1 at its end.
 

@@ -183,7 +183,8 @@ def _detector(request: dict[str, Any], packages: Sequence[Path]) -> Detector:
     gc.disable()  # collecting would take a tenth of the time in which PyTorch is imported
     spec = offer_of(request["plugin"], request["detector"], packages).spec
     arguments = {name: request[name] for name in ("seed", "horizon", "parameters")}
-    detector = make_detector(spec.factory, **arguments, baseline=request.get("baseline", 0))
+    declared = {name: request[name] for name in ("baseline", "roles") if name in request}
+    detector = make_detector(spec.factory, **arguments, **declared)
     gc.enable()
     return detector
 
