@@ -25,7 +25,7 @@ from oodd_eval.errors import OoddError
 
 RATE = 50
 FAULTS = ("silent", "stuck", "nan", "skipping")
-PARAMETERS = {"panel-a": {"forecast": "linear"}}
+PARAMETERS = {"panel": {"forecast": "linear"}}
 """Of the default, which would train networks for most of a minute otherwise."""
 
 
@@ -84,7 +84,7 @@ def main(arguments=None):
     """Watch one episode; return the reading that raised the alarm, or None."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument(
-        "--detector", default="panel-a", help="of `oodd-eval list detectors` (default: panel-a)"
+        "--detector", default="panel", help="of `oodd-eval list detectors` (default: panel)"
     )
     parser.add_argument(
         "--fault", choices=(*FAULTS, "none"), default="stuck", help="what happens (default: stuck)"

@@ -4,7 +4,7 @@
 
 A trained policy balances Gymnasium's CartPole. At an onset the dynamics change: the pole gets
 heavier and longer. The detector is fitted on nominal trajectories of the mini split, and the
-threshold chosen such that at most one nominal episode in ten raises an alarm. `panel-a`, the
+threshold chosen such that at most one nominal episode in ten raises an alarm. `panel`, the
 default, is fitted in a second without its networks; ``--detector pe-a`` (extra reference) takes
 most of a minute and is sooner. With ``--fit FILE`` the watchdog is kept, and the next start takes
 no training; ``--monitor`` shows it at work.
@@ -27,7 +27,7 @@ from oodd_eval import load_split
 
 HEAVIER = {"masspole": 0.4, "length": 1.0}
 """Values after the onset; nominally 0.1 kg and 0.5 m (half of the pole)."""
-PARAMETERS = {"panel-a": {"forecast": "linear"}}
+PARAMETERS = {"panel": {"forecast": "linear"}}
 """Of the default, which would train networks for most of a minute otherwise."""
 
 
@@ -180,7 +180,7 @@ def animate(path, watchdog, onset, seen, every=5):
 def main(arguments=None):
     """Prepare, run a nominal and a changed episode, and say what was noticed when."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--detector", default="panel-a", help="any detector (default: panel-a)")
+    parser.add_argument("--detector", default="panel", help="any detector (default: panel)")
     parser.add_argument("--level", type=float, default=0.1, help="share of nominal episodes")
     parser.add_argument("--seed", type=int, default=7)
     parser.add_argument("--steps", type=int, default=300)

@@ -3,7 +3,7 @@
 `Conformance` tells the conformance checks, whose tests are collected as any others, the detector.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import OoddError, UnknownNameError, UsageError
 from oodd_eval.metrics.catalogue import NAMES
 from oodd_eval.names import counted, select
-from oodd_eval.plugins.discovery import Plugins, discover
+from oodd_eval.plugins.discovery import ACTIONS, Plugins, discover
 from oodd_eval.results.board import Conditions
 from oodd_eval.results.comparison import (
     Difference,
@@ -45,7 +45,9 @@ class Conformance:
         plugins = discover()
         with _usage_errors():
             names = _detectors(config.getoption("oodd_detector"), plugins)
-        self._trials = {name: Trial(plugins.offer(name).spec) for name in names}
+        # The episodes of checks have actions.
+        offers = [plugins.taking_actions(plugins.offer(name), {}, names)[0] for name in names]
+        self._trials = {offer.spec.name: Trial(offer.spec) for offer in offers}
 
     def pytest_generate_tests(self, metafunc: pytest.Metafunc) -> None:
         """Give the shipped tests every detector."""
@@ -72,15 +74,22 @@ class Cells:
         if output := option("oodd_output"):
             read = [self.split.path, Path(option("oodd_reference") or self.split.path)]
             refuse_inputs(Path(output), read, "--oodd-output")
-        self.reference = None
+        self.reference, parameters = None, {}
         if path := option("oodd_reference"):
+            specs = [self.plugins.offer(name).spec for name in names]
+            names = list(dict.fromkeys(n for s in specs for n in (s.name, s.with_actions) if n))
             self.reference = _comparable(read_record_set(path), self.split, names, environments)
+            # Of a detector that takes actions where there are any, it says which rows are run.
+            names = [n for n in names if n in {r.detector for r in self.reference.records}]
+            parameters = {
+                f"{s.name}.{ACTIONS}": "no" for s in specs if s.with_actions and s.name in names
+            }
             if not option("oodd_env"):
                 covered = {record.environment for record in self.reference.records}
                 environments = [name for name in environments if name in covered]
         metrics = self.reference.metrics() if self.reference else ()
         self.tolerances = parse_tolerances(option("oodd_fail"), [*NAMES, *metrics])
-        self.plan = _plan(self.plugins, self.split, names, environments, self.reference)
+        self.plan = _plan(self.plugins, self.split, names, environments, self.reference, parameters)
         self.names = list(map(str, self.plan.cells))
 
     def pytest_report_header(self) -> str:
@@ -203,6 +212,7 @@ def _plan(
     detectors: list[str],
     environments: list[str],
     reference: RecordSet | None,
+    parameters: Mapping[str, str],
 ) -> Plan:
     """Plan what a reference has: its horizons and seeds, at default parameters."""
     cells = [record.cell for record in reference.records] if reference else []
@@ -213,6 +223,7 @@ def _plan(
         environments=environments,
         horizons=sorted({cell.setting.horizon for cell in cells}) or [1],
         seeds=sorted({cell.seed for cell in cells}) or [0],
+        parameters=parameters,
     )
     labels = {cell.label for cell in cells}
     selected = {str(cell) for cell in plan.cells if not reference or cell.label in labels}

@@ -1,7 +1,7 @@
 """Detectors of watchdogs: made by name or passed in, fed row by row even if they do not stream."""
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Self
@@ -29,6 +29,12 @@ Row = NDArray[np.float32]
 Floats = NDArray[np.float64]
 
 
+def has_actions(episodes: Iterable[Trajectory]) -> bool:
+    """Tell whether all of some episodes have actions; not of none."""
+    widths = {episode.actions.shape[1] for episode in episodes}
+    return bool(widths) and 0 not in widths
+
+
 @dataclass(frozen=True, slots=True)
 class DetectorHandle:
     """A detector, with what it takes to make it again.
@@ -54,10 +60,13 @@ class DetectorHandle:
         parameters: Mapping[str, Any],
         baseline: int = 0,
         roles: Sequence[str] = (),
+        *,
+        actions: bool = False,
     ) -> Self:
         """Make a detector of a name or class, or take an instance.
 
-        `baseline` rows and the sensors' `roles` are handed to one that declares them.
+        `baseline` rows and the sensors' `roles` are handed to one that declares them. With
+        `actions` it is the one that takes them, see `Plugins.taking_actions`.
         """
         seed = read("seed", partial(whole_number, least=0), seed)
         horizon = read("horizon", partial(whole_number, least=1), horizon)
@@ -65,9 +74,12 @@ class DetectorHandle:
         if kind is None and statistic is not None:
             expected = ", ".join(map(repr, STATISTICS))
             raise UsageError(f"statistic={statistic!r}, expected one of {expected}")
-        name, actions, adapts = "", True, False
+        name, looks_at_actions, adapts = "", True, False
         if isinstance(detector, str):
-            offer = discover().offer(detector)
+            plugins = discover()
+            offer = plugins.offer(detector)
+            if actions:
+                offer, parameters = plugins.taking_actions(offer, parameters)
             offer.require()
             spec = offer.spec
             adapts = spec.adapts == "baseline"
@@ -79,14 +91,15 @@ class DetectorHandle:
                 baseline=baseline if adapts else 0,
                 roles=roles if spec.roles else (),
             )
-            kind, name, actions = kind or spec.alarm, spec.name, spec.inputs != "observations"
+            kind, name = kind or spec.alarm, spec.name
+            looks_at_actions = spec.inputs != "observations"
         elif isinstance(detector, type) or not isinstance(detector, Detector):
             factory = factory_of(detector)
             detector = make_detector(factory, seed=seed, horizon=horizon, parameters=parameters)
         state: dict[str, Any] = {"name": name, "statistic": kind or "cusum"}
         state |= {"seed": seed, "horizon": horizon}
         state |= {"parameters": dict(parameters), "baseline": baseline, "roles": [*roles]}
-        return cls(detector, kind or "cusum", actions, adapts, state)
+        return cls(detector, kind or "cusum", looks_at_actions, adapts, state)
 
     def visible(self, trajectory: Trajectory, base: Baseline | None = None) -> Trajectory:
         """Return what the detector may see of an episode: all rows if it learns from the first."""

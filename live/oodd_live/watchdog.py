@@ -32,7 +32,7 @@ from oodd_eval.metrics.cusum import Standardization
 from oodd_eval.names import check_known, counted
 from oodd_eval.plugins.contract import AnyDetector, StorableDetector, copied
 from oodd_eval.plugins.state import pack, read_state, write_state
-from oodd_live.handle import DetectorHandle, streaming
+from oodd_live.handle import DetectorHandle, has_actions, streaming
 from oodd_live.nominal import Episode, Nominal, NominalData
 from oodd_live.reading import EpisodeAlarm, Reading, RunLength
 from oodd_live.stream import ACTION, MARGIN, OBSERVATION, Stream, StreamFault, StreamLimits
@@ -130,8 +130,9 @@ class Watchdog:
         ----------
         detector
             Name of an installed detector, a class or function that makes one, or an unfitted one.
-            Without ``update`` it scores the whole episode so far at every row, which a warning
-            says.
+            ``"panel"`` is `panel-a` where training episodes have actions, which `update` is then
+            handed, too; ``parameters={"actions": "no"}`` leaves them out. Without ``update`` a
+            detector scores the whole episode so far at every row, which a warning says.
         train, calibration
             Nominal episodes to fit on, and others for the threshold, both in the order in which
             they were recorded: `Trajectory` objects, observations of shape (T + 1, D), or tuples of
@@ -186,7 +187,14 @@ class Watchdog:
         nominal = data.nominal
         rows = nominal.baseline.rows if nominal.baseline else 0
         handle = DetectorHandle.make(
-            detector, statistic, seed, horizon, parameters or {}, rows, nominal.roles
+            detector,
+            statistic,
+            seed,
+            horizon,
+            parameters or {},
+            rows,
+            nominal.roles,
+            actions=has_actions(data.train),
         )
         settings = Settings(alpha, confidence, data.rate, latch, hold_off)
         if hours is not None:

@@ -192,6 +192,8 @@ def _detector(offer: Offer) -> Lines:
         yield "unavailable", why
     yield "source", spec.reference or "not given"
     yield "looks at", spec.inputs.replace("+", " and ")
+    if spec.with_actions:
+        yield "with actions", f"{spec.with_actions} runs in its place, unless actions is no"
     yield "alarm", "the score itself" if spec.alarm == "score" else "CUSUM of the score"
     yield "trained on", _TRAINING[spec.training]
     yield "seed", "changes nothing" if spec.deterministic else "decides random draws"

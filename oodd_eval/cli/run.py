@@ -136,6 +136,9 @@ def run(options: Options) -> int:
     if not plan.cells:
         return say(f"no cell matches -k {options.expression!r}", 5)
     console = make_console()
+    if options.verbosity >= 0:
+        for note in plan.notes:
+            print_prose(note, console)
     if options.collect_only:
         if options.verbosity >= 0:
             console.print("\n".join(map(str, plan.cells)))

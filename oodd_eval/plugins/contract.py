@@ -236,6 +236,10 @@ class DetectorSpec:
     inputs
         What the scores depend on: observations alone, or commanded actions too. A detector that
         declares observations is handed trajectories whose actions have width 0.
+    with_actions
+        Name of the plug-in's detector that takes this one's place where episodes have actions,
+        unless both are named or the parameter ``actions`` is ``"no"``. It has the same other
+        parameters. Results name the detector that was run.
     deterministic
         Whether the seed changes nothing: results of one seed are then those of all.
     training
@@ -278,6 +282,7 @@ class DetectorSpec:
     summary: str
     reference: str = ""
     inputs: Literal["observations", "observations+actions"] = "observations"
+    with_actions: str = ""
     deterministic: bool = False
     training: Training = "nominal"
     alarm: Alarm = "cusum"

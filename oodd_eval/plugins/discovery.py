@@ -10,7 +10,7 @@ from __future__ import annotations
 import inspect
 import os
 import sys
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.machinery import PathFinder
@@ -18,7 +18,7 @@ from importlib.metadata import EntryPoint
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, TypeVar
 
 import pluggy
 
@@ -27,6 +27,7 @@ from oodd_eval.errors import MissingExtraError, OoddError, PluginError, UnknownN
 from oodd_eval.names import check_known, select
 from oodd_eval.plugins.contract import DetectorSpec
 from oodd_eval.plugins.installed import named, points_of
+from oodd_eval.plugins.parameters import resolve_parameters
 from oodd_eval.plugins.specs import MOST_SPECS, plain_spec
 
 if TYPE_CHECKING:
@@ -45,6 +46,9 @@ _Spec = TypeVar("_Spec", bound=_Named)
 
 _BUILT_IN: Final = "trivial"
 RESTRICT: Final = "OODD_EVAL_PLUGINS"
+ACTIONS: Final = "actions"
+"""Parameter whose value ``"no"`` leaves actions out, see `DetectorSpec.with_actions`."""
+
 LONGEST_REASON: Final = 600  # characters; of a longer one, the start and the end are kept
 
 
@@ -256,6 +260,22 @@ class Plugins:
         check_known("detector", self._offers, name)
         return self._offers[name]
 
+    def taking_actions(
+        self, offer: Offer, parameters: Mapping[str, Any], selected: Collection[str] = ()
+    ) -> tuple[Offer, dict[str, Any]]:
+        """Return what runs where episodes have actions when a detector is named, with parameters.
+
+        It is the detector that its spec names as `with_actions`, unless that is `selected`, too, or
+        the parameter ``actions`` is ``"no"``. `UsageError`: a parameter is wrong.
+        """
+        spec, values = offer.spec, dict(parameters)
+        name = spec.with_actions
+        if not offer.plugin or not name or name in selected or values.get(ACTIONS) == "no":
+            return offer, values
+        resolve_parameters(spec.name, spec.parameters, values, others=spec.other_parameters)
+        values.pop(ACTIONS, None)
+        return self.offer(name), values
+
     def select(self, patterns: str) -> list[str]:
         """Return the names of the detectors that a comma list of names and globs selects."""
         parts = [part.strip() for part in patterns.split(",")]
@@ -327,6 +347,10 @@ class Plugins:
                     advice = f"uninstall one of them, or leave it out with -p no:{point.name}"
                     raise PluginError(f"detector {spec.name!r} is offered twice, by {by}: {advice}")
                 offers[spec.name] = self._offer(point, spec)
+            for offer in offers.values():
+                if (name := offer.spec.with_actions) and name not in offers:
+                    reason = f"with_actions of {offer.spec.name!r} is {name!r}"
+                    raise PluginError(f"{reason}, expected a detector of the same plug-in")
             self._forms[point.name] = plugin.form
             self._offers |= offers
             self.loaded[point.name] = plugin

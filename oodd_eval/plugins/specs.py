@@ -151,6 +151,7 @@ FIELDS: Final[tuple[tuple[str, str, Callable[[Any], bool]], ...]] = (
     ("factory", "a function or class", callable),
     ("summary reference extra fit_name", "a printable line of at most 1000 characters", is_line),
     ("inputs", " or ".join(_INPUTS), _one_of(*_INPUTS)),
+    ("with_actions", "the name of a detector, or ''", _text(f"({SPEC_NAME})?")),
     ("training", " or ".join(get_args(Training)), _one_of(*get_args(Training))),
     ("alarm", " or ".join(get_args(Alarm)), _one_of(*get_args(Alarm))),
     ("adapts", "'' or baseline", _one_of("", "baseline")),

@@ -20,7 +20,7 @@ from oodd_eval.data.condition import Condition
 from oodd_eval.data.facts import PROTOCOL, Group
 from oodd_eval.data.split import Split
 from oodd_eval.errors import UsageError
-from oodd_eval.names import Predicate
+from oodd_eval.names import Predicate, listed
 from oodd_eval.plugins.contract import CONTRACT, Alarm, Training
 from oodd_eval.plugins.discovery import Offer, Plugins
 from oodd_eval.plugins.parameters import parameters_by_detector, parameters_of, resolve_parameters
@@ -72,7 +72,8 @@ class Plan:
     """All units of a run, in the order in which they are recorded.
 
     Of each part the first `limit` trajectories are used; None means all. `groups` are those of
-    anomalies by name, `strengths` the numbers of the split's strengths by environment.
+    anomalies by name, `strengths` the numbers of the split's strengths by environment. `notes` are
+    sentences for the user.
     """
 
     split: str
@@ -81,6 +82,7 @@ class Plan:
     groups: Mapping[str, Group]
     limit: int | None = None
     strengths: Mapping[str, Mapping[Condition, float]] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     @property
     def cells(self) -> list[Cell]:
@@ -148,8 +150,9 @@ def make_plan(
     `anomalies` are kinds or conditions, as `Split.anomalies` has them; by default all. `device` is
     the value of the parameter ``device`` for those detectors that have it. With `rolling`
     calibration, nominal test episodes in recorded order join it once they are judged. `parameters`
-    are for all detectors or for one (`parameters_by_detector`). What is
-    unknown or refused, and a device that no detector has, raises `UsageError`.
+    are for all detectors or for one (`parameters_by_detector`). Where an environment has actions,
+    a detector is the one that takes them (`Plugins.taking_actions`). What is unknown or refused,
+    and a device that no detector has, raises `UsageError`.
     """
     if rolling:
         _check_rolling(split, environments)
@@ -157,16 +160,32 @@ def make_plan(
     values = _parameters(offers, parameters or {})
     if device is not None:
         _set_device(device, offers, values)
-    units = tuple(
-        make_unit(offer, arguments, split, environment, conditions, horizon, seed, limit, rolling)
-        for environment in environments
-        if (conditions := _chosen(split.conditions(environment), anomalies))
-        for offer, arguments in zip(offers, values, strict=True)
-        for horizon in horizons
-        for seed in seeds
-    )
+    units: list[Unit] = []
+    taking: dict[tuple[str, str], list[str]] = {}  # environments by detector and its replacement
+    for environment in environments:
+        conditions = _chosen(split.conditions(environment), anomalies)
+        if not conditions:
+            continue
+        actions = split.manifest["environments"][environment]["actions"]
+        for offer, arguments in zip(offers, values, strict=True):
+            row = offer, arguments
+            if actions:
+                row = plugins.taking_actions(offer, arguments, detectors)
+            if row[0] is not offer:
+                names = offer.spec.name, row[0].spec.name
+                taking.setdefault(names, []).append(environment)
+            units += [
+                make_unit(*row, split, environment, conditions, horizon, seed, limit, rolling)
+                for horizon in horizons
+                for seed in seeds
+            ]
     strengths = {environment: split.strengths(environment) for environment in environments}
-    return Plan(split.name, split.digest, units, split.groups, limit, strengths)
+    notes = tuple(
+        f"{name} takes the actions of {listed(among)}: row {row}; --param {name}.actions=no leaves "
+        "them out"
+        for (name, row), among in taking.items()
+    )
+    return Plan(split.name, split.digest, tuple(units), split.groups, limit, strengths, notes)
 
 
 def _check_rolling(split: Split, environments: Sequence[str]) -> None:

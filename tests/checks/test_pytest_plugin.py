@@ -59,6 +59,15 @@ def altered(reference, path, **figures):
     return path
 
 
+def test_rows_are_those_of_the_reference(cells, tiny_split, tmp_path):
+    records = evaluate("persistence", tiny_split, environments="hopper")
+    for row in ("panel", "panel-a"):
+        write_reference([replace(record, detector=row) for record in records], tmp_path / row)
+        plan = cells(oodd_detector="panel", oodd_reference=tmp_path / row).plan
+        assert [u.setting.detector for u in plan.units] == [row]
+    assert [u.setting.detector for u in cells(oodd_detector="panel").plan.units] == ["panel-a"] * 2
+
+
 def test_off_unless_asked_and_nothing_of_the_harness_is_imported(run, pytester):
     pytester.makepyfile(
         "import sys\n"

@@ -4,6 +4,9 @@ import numpy as np
 import pytest
 from oodd_live import Watchdog
 from oodd_logs import scan_episodes
+from oodd_logs.episodes import Episode
+
+from oodd_eval import Trajectory
 
 MIXING = np.random.default_rng(7).normal(size=(3, 8)) / 2
 SENSORS = [f"joint {i}" for i in range(8)]
@@ -72,3 +75,38 @@ def test_few_data_are_enough_for_a_watchdog(train):
         delays.append(first.t - 150)
         assert readings[-1].sensor == "joint 3"
     assert np.median(delays) <= 5
+
+
+def driven(seed, rows=120):
+    """Two sensors that follow a command, and the command."""
+    rng = np.random.default_rng(seed)
+    commands, noise = rng.normal(size=(rows - 1, 1)), 0.1 * rng.normal(size=(rows, 2))
+    observations = np.zeros((rows, 2))
+    for t, command in enumerate(commands):
+        observations[t + 1] = 0.7 * observations[t] + command
+    return observations + noise, commands
+
+
+def test_a_watchdog_takes_actions_where_training_episodes_have_them(tmp_path):
+    episodes = [driven(seed) for seed in range(30)]
+    watchdog = Watchdog.fit("panel", episodes[:10], episodes[10:])
+    assert repr(watchdog).startswith("Watchdog(panel-a, 2 sensors")
+    watchdog.save(tmp_path / "fit.npz")
+    loaded = Watchdog.load(tmp_path / "fit.npz")
+    assert repr(loaded) == repr(watchdog)
+    test = Trajectory(*driven(99))
+    assert loaded.replay(test) == watchdog.replay(test)
+    without = Watchdog.fit("panel", episodes[:10], episodes[10:], parameters={"actions": "no"})
+    assert repr(without).startswith("Watchdog(panel, ")
+    rows = [x for x, _ in episodes]
+    same = Watchdog.fit("panel", rows[:10], rows[10:])
+    assert repr(same).startswith("Watchdog(panel, ")
+    assert [r.score for r in same.replay(test)] == [r.score for r in without.replay(test)]
+
+
+def test_a_scan_takes_actions_where_episodes_have_them():
+    logs = [Episode(str(i), str(i), *driven(i), None) for i in range(12)]
+    scanned = scan_episodes(logs)
+    assert scanned.judge.startswith("panel-a, ")
+    assert scan_episodes(logs, parameters={"actions": "no"}).judge.startswith("panel, ")
+    assert scan_episodes([rows for rows, _ in map(driven, range(12))]).judge.startswith("panel, ")

@@ -26,7 +26,7 @@ def example():
 def kept(tmp_path_factory, example):
     """File of the watchdog that the example fits by default."""
     file = tmp_path_factory.mktemp("kept") / "fit"
-    example.prepare("panel-a", 0.1, file)
+    example.prepare("panel", 0.1, file)
     return str(file)
 
 

@@ -67,10 +67,12 @@ def check(options: Options) -> int:
             return int(load("oodd_recording.commands:check_custom")(options, selects))
         raise
     refuse(options, ["env"], f"is for anomalies, and {options.name} is a detector")
+    parameters = parameters_by_detector([offer.spec.name], dict(options.param))[offer.spec.name]
+    # The episodes of checks have actions.
+    offer, parameters = plugins.taking_actions(offer, parameters)
     offer.require()
     spec = offer.spec
     check_known("check", CHECKS, *expecting)
-    parameters = parameters_by_detector([spec.name], dict(options.param))[spec.name]
     resolve_parameters(spec.name, spec.parameters, parameters, others=spec.other_parameters)
     names = [name for name in CHECKS if selects(name)]
     if not names:

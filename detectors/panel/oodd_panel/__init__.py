@@ -1,7 +1,7 @@
 """A panel of calibrated members that see different things: one detector for simulators and logs.
 
-Two detectors, which differ in what they look at: `panel` at observations alone, `panel-a` at the
-commanded actions too.
+Two rows, which differ in what they look at: `panel` at observations alone, `panel-a` at the
+commanded actions too. Where episodes have actions, `panel-a` runs in place of `panel`.
 """
 
 from dataclasses import dataclass
@@ -23,18 +23,31 @@ class PanelParameters:
     )
 
 
+@dataclass(frozen=True, slots=True)
+class WithoutActions(PanelParameters):
+    """Parameters of `panel`."""
+
+    actions: str = parameter(
+        "auto",
+        choices=("auto", "no"),
+        decides="nothing",
+        help="auto: panel-a runs in its place where episodes have actions",
+    )
+
+
 def make_panel(
     name: str = "panel", *, seed: int = 0, horizon: int = 1, baseline: int = 0, **parameters: Any
 ) -> Detector:
     """Return an unfitted `oodd_panel.detector.PanelDetector`, by the name of its row."""
     from oodd_panel.detector import PanelDetector  # noqa: PLC0415  keeps the listing quick
 
+    actions = name.endswith("-a")
     return PanelDetector(
         name,
-        checked(PanelParameters, name, parameters),
+        checked(PanelParameters if actions else WithoutActions, name, parameters),
         seed=seed,
         horizon=horizon,
-        actions=name.endswith("-a"),
+        actions=actions,
         baseline=baseline,
     )
 
@@ -51,13 +64,15 @@ def oodd_detectors() -> list[DetectorSpec]:
 
 
 def _spec(*, name: str, summary: str) -> DetectorSpec:
+    actions = name.endswith("-a")
     return DetectorSpec(
         name=name,
         factory=partial(make_panel, name),
         summary=summary,
         reference="Lowry et al. (1992), Jackson & Mudholkar (1979), Ramaswamy et al. (2000)",
-        inputs="observations+actions" if name.endswith("-a") else "observations",
+        inputs="observations+actions" if actions else "observations",
+        with_actions="" if actions else "panel-a",
         alarm="score",
         adapts="baseline",
-        parameters=PanelParameters,
+        parameters=PanelParameters if actions else WithoutActions,
     )

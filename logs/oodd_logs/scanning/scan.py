@@ -14,7 +14,7 @@ from typing import Any, Final, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from oodd_live.handle import DetectorHandle
+from oodd_live.handle import DetectorHandle, has_actions
 from oodd_live.nominal import sensor_names
 from oodd_live.watchdog import Watchdog
 
@@ -236,6 +236,8 @@ def scan_episodes(
         Names, or quantities with names and roles; default "sensor 0" and so on.
     detector
         Name of an installed detector, a class or function that makes one, or an unfitted one.
+        ``"panel"`` is `panel-a` where episodes have actions; ``parameters={"actions": "no"}``
+        leaves them out.
     watchdog
         Judges all episodes in place of a detector that is fitted on them.
     fdr
@@ -298,9 +300,11 @@ def scan_episodes(
     cleaned, spread = clean(usable)
     faults = stream_faults(usable, cleaned, spread, names, fdr)
     defaults = _QUICK if detector == SCANNER else {}
-    fit = _Fit(detector, seed, horizon, {**defaults, **(parameters or {})}, baseline, roles)
-    handle = fit.handle()
     trajectories = [episode.trajectory for episode in cleaned]
+    arguments = {**defaults, **(parameters or {})}
+    actions = has_actions(trajectories)
+    fit = _Fit(detector, seed, horizon, arguments, baseline, roles, actions)
+    handle = fit.handle()
     folds = [range(k, len(usable), FITS) for k in range(min(FITS, len(usable)))]
     training = [[x for i, x in enumerate(trajectories) if i not in fold] for fold in folds]
     left_out = [[trajectories[i] for i in fold] for fold in folds]
@@ -422,12 +426,20 @@ class _Fit:
     horizon: int
     parameters: Mapping[str, Any]
     baseline: int
-    roles: tuple[str, ...] = ()
+    roles: tuple[str, ...]
+    actions: bool
 
     def handle(self) -> DetectorHandle:
         """Return a new detector."""
         return DetectorHandle.make(
-            self.detector, None, self.seed, self.horizon, self.parameters, self.baseline, self.roles
+            self.detector,
+            None,
+            self.seed,
+            self.horizon,
+            self.parameters,
+            self.baseline,
+            self.roles,
+            actions=self.actions,
         )
 
     def judge(
