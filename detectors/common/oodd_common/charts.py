@@ -39,23 +39,22 @@ class Smoother:
 
     def __init__(self, weights: Sequence[float], sensors: int) -> None:
         self._weight = np.asarray(weights, dtype=np.float64)[:, None]  # (W, 1)
+        self._keep = 1.0 - self._weight
+        self._kept, self._settled = self._keep**2, self._weight / (2.0 - self._weight)
         self._z = np.zeros((len(weights), sensors))
         self._forgotten = np.ones((len(weights), 1))
 
     def __call__(self, residuals: Floats) -> Floats:
         """Return the next N scaled, weighted residuals, (W, N, D), from residuals (N, D)."""
-        weight, keep = self._weight, 1.0 - self._weight
-        smoothed = np.empty((len(residuals), *self._z.shape))
+        w, d = self._z.shape
+        smoothed, forgotten = np.empty((w, len(residuals), d)), np.empty((w, len(residuals), 1))
         for t, u in enumerate(residuals):
-            self._z = keep * self._z + weight * u
-            smoothed[t] = self._z
-        # A running product, not a power: its first n factors are the same however many follow.
-        factors = np.broadcast_to(keep**2, (len(residuals), *keep.shape))
-        forgotten = self._forgotten * np.cumprod(factors, axis=0)
-        if len(residuals):
-            self._forgotten = forgotten[-1]
-        smoothed /= np.sqrt(weight / (2.0 - weight) * (1.0 - forgotten))
-        return np.ascontiguousarray(smoothed.swapaxes(0, 1))
+            self._z = self._keep * self._z + self._weight * u
+            # A running product, not a power: its first n factors are the same however many follow.
+            self._forgotten = self._forgotten * self._kept
+            smoothed[:, t], forgotten[:, t] = self._z, self._forgotten
+        smoothed /= np.sqrt(self._settled[:, None] * (1.0 - forgotten))
+        return smoothed
 
 
 def whitening(covariance: Floats, shrinkage: float) -> Floats:
@@ -87,6 +86,10 @@ def product(rows: Floats, matrix: Floats, block: int = BLOCK) -> Floats:
     From (N, K) and (K, M) to (N, M).
     """
     (n, k), (_, m) = rows.shape, matrix.shape
+    if n <= block:
+        few = np.zeros((block, k))
+        few[:n] = rows
+        return np.asarray(np.matmul(few, matrix)[:n], np.float64)
     count = -(-n // block)
     filled = np.zeros((count * block, k))
     filled[:n] = rows
