@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from oodd_common.charts import Floats
+from oodd_common.charts import Floats, limited
 
 from oodd_eval.plugins.contract import Progress, ignore_progress
 from oodd_eval.plugins.forecasting import CONSTANT
@@ -195,8 +195,7 @@ class DensityForecaster:
         return self.units_.changes(steps.now, steps.known.window[:, 0])
 
     def _scaled(self, x: Floats) -> Floats:
-        scaled: Floats = np.clip(x / self.input_scale_, -LIMIT, LIMIT)
-        return scaled
+        return limited(x / self.input_scale_, LIMIT)
 
     def _errors(self, x: Floats, y: Floats) -> Floats:
         """Return what each member's linear forecast leaves of changes, (M, N, D)."""

@@ -245,7 +245,7 @@ class ProbabilisticEnsemble(LongFitDetector):
         it has a chance of about 1 / (n + 1), and no deviation of a standard normal that is less
         likely is evidence of more.
         """
-        moved = (now - self.units_.sensors.mean)[:, self.units_.constant()] / CONSTANT
+        moved = (now - self.units_.sensors.mean)[:, self.units_.constant] / CONSTANT
         size = np.minimum(np.sqrt(2.0 * np.log1p(moved**2)), self.largest_change_)
         changed: Floats = np.sign(moved) * size
         return changed
@@ -262,9 +262,11 @@ class ProbabilisticEnsemble(LongFitDetector):
         return np.concatenate([self.units_.inputs(steps.known), time], axis=1)
 
     def _evidence(self, steps: Transitions, judged: Assessment) -> Evidence:
-        movement = self.units_.changes(steps.now, steps.before)
+        movement, residuals = self.units_.changes(steps.now, steps.before), judged.residuals
+        if residuals.shape[1] < len(self.units_.constant):
+            residuals = np.concatenate([residuals, self._changed(steps.now)], axis=1)
         return Evidence(
-            np.concatenate([judged.residuals, self._changed(steps.now)], axis=1),
+            residuals,
             judged.log_tails,
             np.sqrt((movement**2).sum(axis=1) / max(1, movement.shape[1])),
         )
@@ -273,7 +275,7 @@ class ProbabilisticEnsemble(LongFitDetector):
         """Return each sensor's share in the evidence of single steps, (N, sensors)."""
         explained = np.empty(steps.now.shape)
         explained[:, self.units_.varying] = self.forecaster.explained(steps, judged)
-        explained[:, self.units_.constant()] = self._changed(steps.now) ** 2
+        explained[:, self.units_.constant] = self._changed(steps.now) ** 2
         explained = np.maximum(explained, CONSTANT)
         shares: Floats = explained / explained.sum(axis=1, keepdims=True)
         return shares

@@ -123,9 +123,10 @@ class DensityEnsemble:
         for weights, bias in deeper:
             hidden += _silu(weights @ hidden + bias)
         outputs, d = out @ hidden + out_bias, self._sensors
-        mean, scale, tail, dependence = np.split(outputs, [d, 2 * d, 3 * d], axis=1)
-        scale = np.exp(np.maximum(LOG_SCALE * np.tanh(scale / LOG_SCALE), self._floor))
-        residual = y.mT - mean
+        scale = np.tanh(outputs[:, d : 2 * d] / LOG_SCALE)
+        scale = np.exp(np.maximum(LOG_SCALE * scale, self._floor))
+        tail, dependence = outputs[:, 2 * d : 3 * d], outputs[:, 3 * d :]
+        residual = y.mT - outputs[:, :d]
         known = dependence * residual[:, self._column]
         residual[:, 1:] += np.add.reduceat(known, self._rows, axis=1)
         residual *= scale

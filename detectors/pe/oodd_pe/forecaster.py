@@ -6,12 +6,13 @@ what has not seen it; from these judgements the charts are learnt, whichever for
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from oodd_common.charts import Floats
+from oodd_common.charts import Floats, limited
 
 from oodd_eval.plugins.forecasting import CONSTANT, FeatureScale
 from oodd_eval.plugins.state import Arrays, take
@@ -91,6 +92,8 @@ class Units:
         Latest observations that a forecast uses, W.
     """
 
+    _live: tuple[Known, Floats] | None = None
+
     def __init__(
         self,
         sensors: FeatureScale,
@@ -100,6 +103,13 @@ class Units:
     ) -> None:
         self.sensors, self.varying, self.commands = sensors, varying, commands
         self.window = window
+
+    @functools.cached_property
+    def constant(self) -> NDArray[np.bool_]:
+        """Whether each of all sensors did not vary in training, (sensors,)."""
+        constant = np.ones(len(self.sensors.mean), dtype=bool)
+        constant[self.varying] = False
+        return constant
 
     @property
     def width(self) -> int:
@@ -113,27 +123,27 @@ class Units:
         These are the newest observation, the differences of the window, the actions, and whether
         the window reaches beyond the episode's beginning.
         """
+        # Two parts of a detector ask for those of each row of a stream.
+        if self._live is not None and self._live[0] is known:
+            return self._live[1]
         window, actions, steps = known
         scale, n = self.sensors, len(window)
-        z = np.clip((window - scale.mean) / scale.std, -LIMIT, LIMIT)[:, :, self.varying]
+        z = limited((window - scale.mean) / scale.std, LIMIT)
+        if len(self.varying) < len(self.constant):
+            z = z[:, :, self.varying]
         parts = [z[:, 0], (z[:, :-1] - z[:, 1:]).reshape(n, -1)]
         if self.commands is not None and actions is not None:
             a = (actions - self.commands.mean) / self.commands.std
             parts.append(np.where(np.isnan(a), 0.0, a).reshape(n, -1))
         parts.append((steps[:, None] < self.window - 1).astype(np.float64))
-        return np.concatenate(parts, axis=1)
+        inputs = np.concatenate(parts, axis=1)
+        self._live = (known, inputs) if n == 1 else None
+        return inputs
 
     def changes(self, now: NDArray[np.float32], before: NDArray[np.float32]) -> Floats:
         """Return changes of the varying sensors, in training standard deviations: (N, D)."""
-        change = (now.astype(np.float64) - before) / self.sensors.std
-        varying: Floats = change[:, self.varying]
-        return varying
-
-    def constant(self) -> NDArray[np.bool_]:
-        """Return which of all sensors did not vary in training, (sensors,)."""
-        constant = np.ones(len(self.sensors.mean), dtype=bool)
-        constant[self.varying] = False
-        return constant
+        change: Floats = (now.astype(np.float64) - before) / self.sensors.std
+        return change if len(self.varying) == len(self.constant) else change[:, self.varying]
 
     def arrays(self) -> Arrays:
         """Return what `restored` takes, but for the sensors' scale."""

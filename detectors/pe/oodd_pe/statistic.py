@@ -202,7 +202,9 @@ class Running:
     def __init__(self, charts: Charts, *, accumulate: bool = True) -> None:
         self._charts = charts
         self._weight = np.array(charts.memories if accumulate else [])[:, None]
-        self._limits = charts.limits()
+        self._keep = 1.0 - self._weight
+        self._kept, self._settled = self._keep**2, self._weight / (2.0 - self._weight)
+        self._limits = charts.limits()[:, None]
         self._sums = np.zeros((len(self._weight), len(charts.centre_) + 1))
         self._forgotten = np.ones((len(self._weight), 1))
 
@@ -216,21 +218,18 @@ class Running:
         if not len(self._weight):
             return newest
         whitened = (columns * self._charts.share(movement)[:, None]) @ roots[1:]
-        weight, keep = self._weight, 1.0 - self._weight
-        # A running product, not a power: its first n factors are the same however many follow.
-        factors = np.broadcast_to(keep**2, (len(keep), len(columns)))
-        forgotten = self._forgotten * np.cumprod(factors, axis=1)
-        self._forgotten = forgotten[:, -1:]
-        deviations = np.sqrt(weight / (2.0 - weight) * (1.0 - forgotten))
-        limits = self._limits[:, None] * deviations
-        lengths = np.empty_like(deviations)
-        added = weight[..., None] * whitened
+        lengths = np.empty((len(whitened), len(columns)))
+        added = self._weight[..., None] * whitened
         for t in range(len(columns)):
-            sums = keep * self._sums + added[:, t]
-            length = np.sqrt(np.einsum("wc,wc->w", sums, sums))
-            lengths[:, t] = np.minimum(length, limits[:, t])
-            self._sums = sums * (lengths[:, t] / np.maximum(length, CONSTANT))[:, None]
-        return np.concatenate([newest, lengths / deviations])
+            # A running product, not a power: its first n factors are the same however many follow.
+            self._forgotten = self._forgotten * self._kept
+            deviations = np.sqrt(self._settled * (1.0 - self._forgotten))
+            sums = self._keep * self._sums + added[:, t]
+            length = np.sqrt(np.einsum("wc,wc->w", sums, sums))[:, None]
+            below = np.minimum(length, self._limits * deviations)
+            self._sums = sums * (below / np.maximum(length, CONSTANT))
+            lengths[:, t : t + 1] = below / deviations
+        return np.concatenate([newest, lengths])
 
 
 def _lengths(whitened: Floats) -> Floats:
