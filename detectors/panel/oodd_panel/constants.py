@@ -14,9 +14,9 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from oodd_common.charts import Floats, Smoother, product
+from oodd_common.charts import Floats, Smoother, limited, product
 
-from oodd_panel.forecast import StandardEpisode, regressors
+from oodd_panel.forecast import ROWS, StandardEpisode, regressors
 
 LAGS: Final = 6
 """Latest observations, and actions, that this forecast uses: noise of sensors is averaged out."""
@@ -48,8 +48,6 @@ SQUARED_LIMIT: Final = 12.0
 """Limit of an error in the sums of squares."""
 MOVED: Final = (0.1, 0.03, 0.015)
 """Weights with which rows before the newest are forgotten in the tests of the constants."""
-ROWS: Final = 8
-"""Rows that are multiplied by a matrix at once: few, as a stream pays for all of them."""
 MOVED_LIMIT: Final = 6.0
 """Limit of an error in the tests of the constants."""
 
@@ -249,8 +247,8 @@ class EpisodeCharts:
         """
         errors = self.errors(regressed, observed)
         n = len(errors)
-        signed = self._signed(np.clip(errors, -SIGNED_LIMIT, SIGNED_LIMIT))
-        squared = self._squared(np.clip(errors, -SQUARED_LIMIT, SQUARED_LIMIT) ** 2)
+        signed = self._signed(limited(errors, SIGNED_LIMIT))
+        squared = self._squared(limited(errors, SQUARED_LIMIT) ** 2)
         parts = [np.abs(signed).swapaxes(0, 1), squared.swapaxes(0, 1)]
         return np.concatenate([*(part.reshape(n, -1) for part in parts), self._moved], axis=1)
 
@@ -275,13 +273,13 @@ class EpisodeCharts:
             self._left -= 1
             self._precision = self._precision + directions @ directions.T
             self._covariance = np.asarray(np.linalg.inv(self._precision), np.float64)
-            limited = np.clip(errors[t], -FOLLOWED, FOLLOWED) * size
-            self._mean = self._mean + self._covariance @ (directions @ limited)
+            followed = limited(errors[t], FOLLOWED) * size
+            self._mean = self._mean + self._covariance @ (directions @ followed)
             return
         # Had the constants moved by m, the sum of z e would be (sum of z z') m.
         keep, cube = self._keep, self._keep[:, :, None]
         seen = directions @ directions.T
-        score = directions @ np.clip(left, -MOVED_LIMIT, MOVED_LIMIT)
+        score = directions @ limited(left, MOVED_LIMIT)
         self._score = keep * self._score + score
         self._information = cube * self._information + seen
         self._spread = cube**2 * self._spread + seen

@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from oodd_common.charts import Floats, product
+from oodd_common.charts import Floats, limited, product
 from oodd_common.windows import LongFitDetector
 from oodd_pe import make_pe
 
@@ -36,6 +36,7 @@ from oodd_panel.constants import (
 )
 from oodd_panel.forecast import (
     ORDER,
+    ROWS,
     EpisodeLearner,
     LinearForecast,
     StandardEpisode,
@@ -59,7 +60,7 @@ WIDEST: Final = 150
 """Most regressors with coefficients of each episode: their covariance takes the square of it."""
 GAIN: Final = 0.5
 """Most that learning may leave of the variance between episodes' mean errors, to be of use."""
-ROWS: Final = 10_000
+SAMPLE: Final = 10_000
 """Most rows from which a member learns."""
 ENSEMBLE: Final = "ensemble."
 """Prefix of the ensemble's part of a state."""
@@ -261,8 +262,7 @@ class PanelDetector(LongFitDetector):
     def _standard(self, rows: NDArray[np.float32], shift: Shift | None) -> Floats:
         shifted = rows if shift is None else shift(rows)
         scale = self.observation_scale_
-        standard: Floats = np.clip((shifted - scale.mean) / scale.std, -LIMIT, LIMIT)
-        return standard
+        return limited((shifted - scale.mean) / scale.std, LIMIT)
 
     def _row(self, observation: NDArray[np.float32]) -> NDArray[Any]:
         row = self._scale().checked(observation)
@@ -279,7 +279,7 @@ class PanelDetector(LongFitDetector):
 
     def _levels(self, rows: Floats) -> Floats:
         """Return principal components of standardized rows, or the rows where they are few."""
-        return product(rows, self.basis_) if self.basis_.size else rows
+        return product(rows, self.basis_, ROWS) if self.basis_.size else rows
 
     def _shift_of(self, x: Trajectory) -> Shift | None:
         return self.baseline_.shift(x.observations[: self.baseline]) if self.baseline else None
@@ -541,7 +541,7 @@ class PanelDetector(LongFitDetector):
             [episode for _, episode in episodes], self.horizon, ridge, varies=varies
         )
         total = sum(len(rows) for rows, _ in episodes)
-        step = -(-total // ROWS)
+        step = -(-total // SAMPLE)
         parts = [self._steps(*x, forecast) for x in episodes]
         members: list[PanelMember] = []
         for kind in MEMBERS:

@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from oodd_common.charts import Floats, product
+from oodd_common.charts import Floats, limited, product
 
 ORDER: Final = 3
 """Latest observations, and actions, that a forecast uses."""
@@ -26,6 +26,8 @@ SURPRISE: Final = 4.0
 """Scales to which an error is limited before an episode's coefficients follow it."""
 WILD: Final = 10.0
 """Limit of an error, in training standard deviations, where penalties are compared."""
+ROWS: Final = 8
+"""Rows that are multiplied by a matrix at once: few, as a stream pays for all of them."""
 
 
 class StandardEpisode(NamedTuple):
@@ -150,7 +152,7 @@ class LinearForecast(NamedTuple):
 
     def __call__(self, regressed: Floats) -> Floats:
         """Return forecasts with the mean coefficients: (N, K) to (N, D)."""
-        return product(regressed, self.coefficients)
+        return product(regressed, self.coefficients, ROWS)
 
 
 def _errors(moments: _Moments, coefficients: Floats) -> Floats:
@@ -192,10 +194,11 @@ class EpisodeLearner:
             errors[t] = self._step(regressed[t], observed[t])
         self._left -= first
         x = regressed[first:]
-        error = observed[first:] - product(x, self._coefficients)
+        error = observed[first:] - product(x, self._coefficients, ROWS)
         variance = 1.0
         if len(self._covariance):
-            variance = 1.0 + (product(x, self._covariance) * x).sum(axis=1, keepdims=True)
+            spread = product(x, self._covariance, ROWS) * x
+            variance = 1.0 + spread.sum(axis=1, keepdims=True)
         errors[first:] = error / (self._forecast.scale * np.sqrt(variance))
         return errors
 
@@ -205,7 +208,6 @@ class EpisodeLearner:
         scale = self._forecast.scale * np.sqrt(variance)
         error: Floats = (observed - x @ self._coefficients) / scale
         gain = spread / variance
-        limited = np.clip(error, -SURPRISE, SURPRISE) * scale
-        self._coefficients = self._coefficients + np.outer(gain, limited)
+        self._coefficients = self._coefficients + np.outer(gain, limited(error, SURPRISE) * scale)
         self._covariance = self._covariance - np.outer(gain, spread)
         return error

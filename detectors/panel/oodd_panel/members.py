@@ -11,9 +11,10 @@ from abc import ABC, abstractmethod
 from typing import ClassVar, Final, NamedTuple
 
 import numpy as np
-from oodd_common.charts import Floats, Smoother, product
+from oodd_common.charts import Floats, Smoother, limited, product
 
 from oodd_eval.plugins.state import Arrays, take
+from oodd_panel.forecast import ROWS
 
 WINDOW: Final = (5, 20)
 """Fewest and most of the latest rows in which a pattern is looked for."""
@@ -84,6 +85,7 @@ class Latest:
 
     def __init__(self, dimensions: int, window: int) -> None:
         self._window = window
+        self._lags = np.arange(window)[::-1]
         self._smoother = Smoother(WEIGHTS, dimensions)
         self._rows: Floats | None = None
         self._levels: Floats
@@ -101,7 +103,7 @@ class Latest:
             self._rows = np.repeat(rows[:1], self._window - 1, axis=0)
             self._levels = np.repeat(levels[:1], LEVEL - 1, axis=0)
         every = np.concatenate([self._rows, rows])
-        window = np.concatenate([every[lag : lag + n] for lag in range(self._window)[::-1]], axis=1)
+        window = every[np.arange(n)[:, None] + self._lags].reshape(n, -1)
         all_levels = np.concatenate([self._levels, levels])
         squares = np.concatenate([self._squares, np.minimum(errors**2, LARGEST)])
         # Sums of few terms in a fixed order: the same bits for one row as for many.
@@ -109,7 +111,7 @@ class Latest:
         energy = _sum([squares[lag : lag + n] for lag in range(ENERGY)])
         self._rows, self._levels = every[n:], all_levels[n:]
         self._squares = squares[n:]
-        sums = self._smoother(np.clip(errors, -CLIP, CLIP)).swapaxes(0, 1)
+        sums = self._smoother(limited(errors, CLIP)).swapaxes(0, 1)
         return Features(window, level, sums, np.log(energy / ENERGY + LEAST_ENERGY))
 
 
@@ -167,7 +169,8 @@ class _Mahalanobis(PanelMember):
         shrinkage = max(SHRINKAGE, f / (max(1.0, n / self.memory) + f))
         correlation = (1 - shrinkage) * (scaled.T @ scaled) / n + shrinkage * np.eye(f)
         # Of a positive definite matrix: rows times the root have the Mahalanobis length.
-        self.root_ = np.linalg.inv(np.linalg.cholesky(correlation)).T / size[:, None]
+        root = np.linalg.inv(np.linalg.cholesky(correlation)).T / size[:, None]
+        self.root_ = np.ascontiguousarray(root)
 
     def _centre(self, features: Floats) -> Floats:
         centre: Floats = features.mean(axis=0)
@@ -176,25 +179,25 @@ class _Mahalanobis(PanelMember):
     def differences(self, features: Floats) -> tuple[Floats, Floats]:
         """Return lengths (N,), and what each feature contributes to their squares, (N, F)."""
         centred = features - self.centre_
-        whitened = product(centred, self.root_)
-        return np.sqrt((whitened * whitened).sum(axis=1)), centred * product(whitened, self.root_.T)
+        whitened = product(centred, self.root_, ROWS)
+        contributed = centred * product(whitened, self.root_.T, ROWS)
+        return np.sqrt((whitened * whitened).sum(axis=1)), contributed
 
     def lengths(self, features: Floats) -> Floats:
         """Return lengths of features: (N, F) to (N,)."""
-        whitened = product(features - self.centre_, self.root_)
+        whitened = product(features - self.centre_, self.root_, ROWS)
         lengths: Floats = np.sqrt((whitened * whitened).sum(axis=1))
         return lengths
 
     def arrays(self) -> Arrays:
         """Return what `restore` takes."""
-        # As it lies in memory, on which the last bit of a product depends.
         return {"centre": self.centre_, "root": self.root_.T}
 
     def restore(self, arrays: Arrays) -> None:
         """Take over a fit."""
         self.centre_ = take(arrays, "centre", (None,))
         f = len(self.centre_)
-        self.root_ = take(arrays, "root", (f, f)).T
+        self.root_ = np.ascontiguousarray(take(arrays, "root", (f, f)).T)
 
 
 class Sums(_Mahalanobis):
@@ -257,12 +260,16 @@ class Pattern(PanelMember):
         components = vectors[:, :kept]
         if n < f:
             components = few.T @ components / np.sqrt(np.maximum(values[:kept], 1e-12))
+        self._prepare(components)
+
+    def _prepare(self, components: Floats) -> None:
         self.components_ = np.ascontiguousarray(components)
+        self._back = np.ascontiguousarray(components.T)
 
     def differences(self, features: Floats) -> tuple[Floats, Floats]:
         """Return lengths (N,), and what each feature contributes to their squares, (N, F)."""
         centred = features - self.centre_
-        left = centred - product(product(centred, self.components_), self.components_.T)
+        left = centred - product(product(centred, self.components_, ROWS), self._back, ROWS)
         squares = left * left
         return np.sqrt(squares.sum(axis=1)), squares
 
@@ -273,7 +280,7 @@ class Pattern(PanelMember):
     def restore(self, arrays: Arrays) -> None:
         """Take over a fit."""
         self.centre_ = take(arrays, "centre", (None,))
-        self.components_ = take(arrays, "components", (len(self.centre_), None))
+        self._prepare(take(arrays, "components", (len(self.centre_), None)))
 
 
 class NeighbourDistance(PanelMember):
@@ -295,32 +302,32 @@ class NeighbourDistance(PanelMember):
         self._prepare()
 
     def _prepare(self) -> None:
-        self._transposed = np.ascontiguousarray(self.bank_.T)
+        self._doubled = np.ascontiguousarray(-2.0 * self.bank_.T)
         self._squares = (self.bank_ * self.bank_).sum(axis=1)
         self._nearest = min(NEIGHBOURS, len(self.bank_))
 
     def differences(self, features: Floats) -> tuple[Floats, Floats]:
         """Return lengths (N,), and what each feature contributes to their squares, (N, F)."""
         centred = features - self.centre_
-        query = product(centred, self.components_)
+        query = product(centred, self.components_, ROWS)
         squares = self._distances(query)
         nearest = np.argpartition(squares, self._nearest - 1, axis=1)[:, : self._nearest]
-        middle = product(self.bank_[nearest].mean(axis=1), self.components_.T)
-        inside = product(query, self.components_.T)
+        middle = product(self.bank_[nearest].mean(axis=1), self.components_.T, ROWS)
+        inside = product(query, self.components_.T, ROWS)
         return self._means(squares), (inside - middle) ** 2
 
     def lengths(self, features: Floats) -> Floats:
         """Return lengths of features: (N, F) to (N,)."""
         lengths = np.empty(len(features))
         for i in range(0, len(features), 4096):
-            query = product(features[i : i + 4096] - self.centre_, self.components_)
+            query = product(features[i : i + 4096] - self.centre_, self.components_, ROWS)
             lengths[i : i + 4096] = self._means(self._distances(query))
         return lengths
 
     def _distances(self, query: Floats) -> Floats:
-        squares = (query * query).sum(axis=1, keepdims=True) + self._squares
-        squares -= 2.0 * product(query, self._transposed)
-        return np.asarray(squares, np.float64)
+        squares: Floats = (query * query).sum(axis=1, keepdims=True) + self._squares
+        squares += product(query, self._doubled, ROWS)
+        return squares
 
     def _means(self, squares: Floats) -> Floats:
         nearest = np.partition(squares, self._nearest - 1, axis=1)[:, : self._nearest]
