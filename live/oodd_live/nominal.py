@@ -1,6 +1,6 @@
 """Nominal episodes that a watchdog is fitted on: of a split, trajectories, or arrays."""
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import Any, Self, TypeAlias
 
@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from oodd_eval.data.baseline import Baseline, check_baseline, episode_means
 from oodd_eval.data.facts import roles_of
 from oodd_eval.data.offsets import fit_offsets
-from oodd_eval.data.parts import EnvironmentData
+from oodd_eval.data.parts import CALIBRATION, EnvironmentData
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import TrajectoryError, UsageError
 from oodd_eval.metrics.promise import EpisodeMeans, PromiseFinding, promises
@@ -79,6 +79,8 @@ class NominalData:
         Rows in a second, None where it is not known.
     recorded
         Whether the order of episodes is that in which they were recorded.
+    recordings
+        For each calibration episode the recording that it is a window of; None where each is one.
     """
 
     train: list[Trajectory]
@@ -87,6 +89,7 @@ class NominalData:
     nominal: Nominal
     rate: float | None
     recorded: bool
+    recordings: Sequence[Hashable] | None = None
 
     @classmethod
     def of(
@@ -98,6 +101,7 @@ class NominalData:
         offsets: Sequence[float] | None,
         baseline: int | None,
         rate: float | None,
+        recordings: Sequence[Hashable] | None = None,
     ) -> Self:
         """Take the arguments of `Watchdog.fit`; what is None is a split's own, if it has it."""
         further: list[Trajectory] = []
@@ -110,6 +114,7 @@ class NominalData:
                 )
             data, facts = train, train.logs
             train, calibration, sensors = data.train, data.calibration, sensors or data.sensors
+            recordings = data.recordings(CALIBRATION) if recordings is None else recordings
             recorded = facts is not None and facts.order == "recorded"
             if facts is not None:
                 further, rate = list(data.twins), rate or facts.rate
@@ -134,7 +139,7 @@ class NominalData:
             check_baseline(map(len, calibrating), rows, "calibration")
         base = Baseline.fit(training, rows) if rows else None
         nominal = Nominal(names, subtracted, base, roles_of(sensors or ()))
-        return cls(training, calibrating, further, nominal, rate, recorded)
+        return cls(training, calibrating, further, nominal, rate, recorded, recordings)
 
     def findings(self) -> list[PromiseFinding]:
         """Return what was tested about the promise."""

@@ -3,7 +3,7 @@
 import itertools
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Self, TypeAlias
@@ -25,7 +25,9 @@ from oodd_eval.metrics.alarms import (
     Calibration,
     GuaranteedAlarm,
     Monitor,
+    halves,
     least_episodes,
+    numbered,
     too_few,
 )
 from oodd_eval.metrics.cusum import Standardization
@@ -37,7 +39,7 @@ from oodd_live.nominal import Episode, Nominal, NominalData
 from oodd_live.reading import EpisodeAlarm, Reading, RunLength
 from oodd_live.stream import ACTION, MARGIN, OBSERVATION, Stream, StreamFault, StreamLimits
 
-KIND: Final = "watchdog/3"
+KIND: Final = "watchdog/4"
 DETECTOR: Final = "detector."
 """Prefix of the detector's arrays among those of a saved watchdog."""
 
@@ -114,6 +116,7 @@ class Watchdog:
         sensors: Sequence[Any] | None = None,
         baseline: int | None = None,
         offsets: Sequence[float] | None = None,
+        recordings: Sequence[Hashable] | None = None,
         margin: float = MARGIN,
         latch: bool = True,
         hold_off: int = 0,
@@ -156,6 +159,10 @@ class Watchdog:
         offsets
             Subtracted from the sensors in float64, which a `Trajectory` has behind it already. By
             default what arrays of float64 need, so that float32 can tell their spread.
+        recordings
+            For each calibration episode the recording that it is a window of, such as its file; an
+            environment of a split knows them. Windows of one recording count once, and too few
+            recordings promise nothing.
         margin
             Share of a sensor's range in training by which a reading may leave it, before it is no
             measurement any more; infinite to leave it to the detector.
@@ -182,7 +189,13 @@ class Watchdog:
         if rate is not None and not rate > 0:
             raise UsageError(f"rate={rate!r}, expected observations in a second, above 0")
         data = NominalData.of(
-            train, calibration, sensors=sensors, offsets=offsets, baseline=baseline, rate=rate
+            train,
+            calibration,
+            sensors=sensors,
+            offsets=offsets,
+            baseline=baseline,
+            rate=rate,
+            recordings=recordings,
         )
         nominal = data.nominal
         rows = nominal.baseline.rows if nominal.baseline else 0
@@ -216,7 +229,10 @@ class Watchdog:
                 warnings.warn(finding.text, PromiseWarning, stacklevel=2)
         if hours is None:
             faults = [limits.faults(x, nominal.baseline) for x in calibrating]
-            fitted = _calibrated(scores, faults, handle.alarm)
+            fitted = _calibrated(scores, faults, handle.alarm, data.recordings)
+            if text := fitted.no_promise(alpha, confidence):
+                warnings.warn(text, PromiseWarning, stacklevel=2)
+                notes.insert(0, text)
             rule = _guaranteed(fitted, faults, settings, nominal.sensors)
             if any(faults):
                 notes.append(_faults_note(faults, nominal.sensors))
@@ -229,6 +245,8 @@ class Watchdog:
         """The promise on false alarms as a sentence."""
         if (r := self.run_length) is None:
             alpha, confidence = self.settings.alpha, self.settings.confidence
+            if self.calibration and (text := self.calibration.no_promise(alpha, confidence)):
+                return text
             sure = f", with {100 * confidence:.3g} % confidence" if confidence else ""
             return f"at most {100 * alpha:.3g} % of nominal episodes raise an alarm{sure}"
         interval = f"95 % interval {r.low:.3g} to {r.high:.3g} h"
@@ -522,6 +540,8 @@ class Watchdog:
                 "largest": [x if math.isfinite(x) else str(x) for x in calibration.largest],
                 "episodes": calibration.episodes,
                 "rolling": calibration.rolling,
+                "recordings": calibration.recordings,
+                "recording_count": calibration.recording_count,
             },
             "run_length": self.run_length and list(astuple(self.run_length)),
             "settings": asdict(self.settings),
@@ -589,6 +609,8 @@ class Watchdog:
             tuple(map(float, calibration_values["largest"])),
             int(calibration_values["episodes"]),
             bool(calibration_values["rolling"]),
+            tuple(map(int, calibration_values["recordings"])),
+            int(calibration_values["recording_count"]),
         )
         setting_values = values["settings"]
         settings = Settings(
@@ -651,15 +673,19 @@ _Faults: TypeAlias = Mapping[int | str, StreamFault]
 
 
 def _calibrated(
-    scores: Sequence[Floats], faults: Sequence[_Faults], kind: AlarmKind
+    scores: Sequence[Floats],
+    faults: Sequence[_Faults],
+    kind: AlarmKind,
+    recordings: Sequence[Hashable] | None,
 ) -> Calibration:
     """Return the calibration, in which an episode with a fault alarms at any threshold."""
     # Those that standardize stay.
+    standardizing = {*halves(numbered(recordings, len(scores)))[0].tolist()}
     counted = [
-        np.array([np.inf]) if f and (kind == "score" or i % 2) else s
+        np.array([np.inf]) if f and (kind == "score" or i not in standardizing) else s
         for i, (f, s) in enumerate(zip(faults, scores, strict=True))
     ]
-    return Calibration.fit(counted, kind)
+    return Calibration.fit(counted, kind, recordings)
 
 
 def _guaranteed(

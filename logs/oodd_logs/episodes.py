@@ -75,6 +75,8 @@ class Episode:
         Seconds of its rows, where the recording has stamps.
     fields
         Values that hold for the whole recording.
+    recording
+        Number of the recording that it is a window of; None where it is one of its own.
     """
 
     name: str
@@ -88,6 +90,7 @@ class Episode:
     kind: str = ""
     time: Times | None = None
     fields: Mapping[str, Any] = field(default_factory=dict)
+    recording: int | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,6 +108,7 @@ class EpisodeFacts:
     begin: float
     step: float
     fields: Mapping[str, Any]
+    recording: int
 
 
 @dataclass(slots=True, eq=False)
@@ -206,6 +210,7 @@ class EpisodeSource:
                 "" if facts.part in {EVERY, *NOMINAL_ROLES} else facts.part.removeprefix("test/"),
                 time if np.isfinite(facts.begin) else None,
                 facts.fields,
+                facts.recording,
             )
 
 
@@ -463,6 +468,7 @@ def _add(reading: _Reading, recorded: Recorded) -> None:
                 task,
                 *stretch.begin_and_step(start, stop),
                 recording.fields,
+                reading.recordings - 1,
             )
             _keep(reading, facts)
 

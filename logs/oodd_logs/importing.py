@@ -6,6 +6,7 @@ compare the two from the onset on.
 """
 
 import dataclasses
+import itertools
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -415,6 +416,7 @@ class _Target:
                 custom=environment_facts,
                 # What earlier versions could import keeps its digest.
                 logs=None if facts == LogFacts() else facts,
+                recordings=_recordings(source),
             )
             entries = {**entries, environment: entry}
             ordered = {name: entries[name] for name in in_order(entries, ENVIRONMENTS)}
@@ -446,6 +448,13 @@ def _groups(source: EpisodeSource, progress: Say, *, paired: bool) -> Iterator[t
                 arrays["interval_offsets"] = np.cumsum([0, *counts])
             yield part, arrays
         progress(part)
+
+
+def _recordings(source: EpisodeSource) -> dict[str, list[int]]:
+    """Return the recording of each episode by part, empty where each episode is one."""
+    recordings = {part: [f.recording for f in facts] for part, facts in source.parts.items()}
+    every = [*itertools.chain(*recordings.values())]
+    return recordings if len({*every}) < len(every) else {}
 
 
 def _texts(texts: Sequence[str]) -> NDArray[np.bytes_]:

@@ -309,10 +309,12 @@ def write_environment(
     actions: Sequence[Quantity],
     custom: Mapping[str, Any] | None = None,
     logs: LogFacts | None = None,
+    recordings: Mapping[str, Sequence[int]] | None = None,
 ) -> dict[str, Any]:
     """Write an environment's groups, one at a time, in one step; return its manifest entry.
 
-    `custom` is what `own_facts` returns. `logs` are the facts of an imported environment.
+    `custom` is what `own_facts` returns. `logs` are the facts of an imported environment, and
+    `recordings` numbers of the recordings that its episodes are windows of, by part.
     """
     described = {"logs": dataclasses.asdict(logs)} if logs else {}
     paired = is_paired(described)
@@ -341,7 +343,36 @@ def write_environment(
             entries[name] = {"sha256": digest, "trajectories": n, "transitions": total}
         check_names(path.name, written)
     entry = {"groups": entries, **names, **(custom or {}), **described}
-    return {"file": path.name, "policy": policy, "digest": environment_digest(entry), **entry}
+    # No part of the digest: it is of the episodes.
+    texts = {part: packed_recordings(numbers) for part, numbers in (recordings or {}).items()}
+    windows = {"recordings": texts} if texts else {}
+    digest = environment_digest(entry)
+    return {"file": path.name, "policy": policy, "digest": digest, **entry, **windows}
+
+
+def packed_recordings(numbers: Iterable[int]) -> str:
+    """Return the numbers of recordings, one an episode, as a manifest has them.
+
+    >>> packed_recordings([0, 0, 0, 1, 0])
+    '0x3 1x1 0x1'
+    """
+    runs = ((number, len([*run])) for number, run in itertools.groupby(numbers))
+    return " ".join(f"{number}x{n}" for number, n in runs)
+
+
+def recordings_of(entry: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
+    """Return numbers of recordings, one an episode, by part; `SplitError` for other numbers."""
+    recordings = {}
+    for part, text in entry.get("recordings", {}).items():
+        runs = [run.split("x") for run in text.split()]
+        expected = entry["groups"].get(part, {}).get("trajectories")
+        if sum(int(n) for _, n in runs) != expected:
+            raise SplitError(
+                f"{entry['file']}: the recordings of {part} are not those of {expected} episodes: "
+                "import it again"
+            )
+        recordings[part] = tuple(number for number, n in runs for _ in range(int(n)))
+    return recordings
 
 
 def _write(group: h5py.Group, name: str, content: NDArray[Any] | Blocks, dtype: str) -> None:
@@ -406,12 +437,14 @@ def _manifest_schema() -> Any:
     )
     logs["extra_behavior"] = "forbid"
     roles = core_schema.list_schema(core_schema.literal_schema([*get_args(Role)]))
+    runs = core_schema.str_schema(pattern=r"^([0-9]{1,9}x[0-9]{1,9}( [0-9]{1,9}x[0-9]{1,9})*)?$")
     optional_fields = {
         "own": custom,
         "roles": roles,
         "strengths": strengths,
         "units": units,
         "logs": logs,
+        "recordings": by_name(parts, runs),
     }
     for key, optional in optional_fields.items():
         environment["fields"][key] = core_schema.typed_dict_field(optional, required=False)

@@ -277,8 +277,10 @@ class EnvironmentData:
         discrete: bool = False,
         logs: LogFacts | None = None,
         roles: Sequence[Role] = (),
+        recordings: Mapping[str, tuple[str, ...]] | None = None,
     ) -> None:
         self.id, self.digest, self.discrete, self.logs = environment, digest, discrete, logs
+        self._recordings = dict(recordings or {})
         self._file, self._parts = file, parts
         nominal = (TrajectorySet(parts, part) for part in NOMINAL)
         self.train, self.calibration, self.twins = nominal
@@ -300,6 +302,22 @@ class EnvironmentData:
     def paired(self) -> bool:
         """True where each anomalous episode has a nominal twin."""
         return self.logs is None or self.logs.paired
+
+    def recordings(self, part: str) -> tuple[str, ...] | None:
+        """Return for each episode of a part the recording of the logs that it is a window of.
+
+        Parameters
+        ----------
+        part
+            Such as ``"calibration"``.
+
+        Returns
+        -------
+        tuple of str or None
+            Equal texts for windows of one recording, in all parts. None where the split does not
+            say it: every episode is a recording, or a simulator's, or an earlier version wrote it.
+        """
+        return self._recordings.get(part)
 
     def test_set(self, condition: str | Condition) -> TrajectorySet:
         """Return test episodes: of an anomaly, with twins or without, or ``"nominal"`` ones.

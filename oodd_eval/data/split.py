@@ -363,8 +363,16 @@ class Split:
         entry = self.manifest["environments"][name]
         digest = layout.environment_digest(entry)
         discrete, logs = layout.discrete_actions(name, entry), layout.log_facts(entry)
-        roles = layout.roles_in(name, entry)
-        return EnvironmentData(name, file, parts, digest, discrete=discrete, logs=logs, roles=roles)
+        return EnvironmentData(
+            name,
+            file,
+            parts,
+            digest,
+            discrete=discrete,
+            logs=logs,
+            roles=layout.roles_in(name, entry),
+            recordings=layout.recordings_of(entry),
+        )
 
     @contextlib.contextmanager
     def opened(self) -> Iterator[Callable[[str], EnvironmentData]]:

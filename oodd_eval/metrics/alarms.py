@@ -4,10 +4,14 @@ The threshold is a rank among the calibration episodes' largest statistics (spli
 prediction). A new nominal episode is exchangeable with them, so that its largest statistic exceeds
 the k-th smallest of n with probability at most ``1 - k / (n + 1)``, whatever the distribution of
 scores and however they depend on one another within an episode.
+
+Windows of one recording are not exchangeable with those of another. They share the weight of one
+episode, so that the promise holds for a window of a further recording (hierarchical conformal
+prediction; Lee, Barber & Willett, arXiv 2306.06342).
 """
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Hashable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Literal, get_args
 
@@ -19,6 +23,7 @@ from oodd_eval.metrics.auc import AlarmRule, Contribution, mean_of
 from oodd_eval.metrics.binomial import incomplete_beta
 from oodd_eval.metrics.catalogue import FOUND_WITHIN, GUARANTEED, LEVELS
 from oodd_eval.metrics.cusum import DRIFT, Standardization, cusum
+from oodd_eval.names import counted
 
 Floats = NDArray[np.float64]
 
@@ -60,6 +65,7 @@ class GuaranteedAlarm:
         level: float,
         kind: AlarmKind = "cusum",
         confidence: float | None = None,
+        recordings: Sequence[Hashable] | None = None,
     ) -> "GuaranteedAlarm":
         """Find the threshold on the scores of nominal episodes, kept apart from the fit.
 
@@ -75,6 +81,8 @@ class GuaranteedAlarm:
             score itself, for a detector that accumulates by itself; the threshold is from all.
         confidence
             See `quantile_rank`.
+        recordings
+            See `Calibration.fit`.
 
         Returns
         -------
@@ -86,7 +94,7 @@ class GuaranteedAlarm:
             Where no statistic could exceed the threshold, because there are too few episodes for
             the level, or too many of them have an infinite statistic.
         """
-        return cls.fits(calibration, [level], kind, confidence)[0]
+        return cls.fits(calibration, [level], kind, confidence, recordings)[0]
 
     @classmethod
     def fits(
@@ -95,9 +103,10 @@ class GuaranteedAlarm:
         levels: Sequence[float],
         kind: AlarmKind = "cusum",
         confidence: float | None = None,
+        recordings: Sequence[Hashable] | None = None,
     ) -> "list[GuaranteedAlarm]":
         """Find the thresholds of several levels as `fit` does, each episode's statistic once."""
-        fitted_calibration = Calibration.fit(calibration, kind)
+        fitted_calibration = Calibration.fit(calibration, kind, recordings)
         return [fitted_calibration.rule(level, confidence) for level in levels]
 
     def statistic(self, scores: Floats) -> Floats:
@@ -131,7 +140,12 @@ class Calibration:
     episodes
         Number of all episodes, those that standardize the scores included.
     rolling
-        Whether an episode counts `FADING` to the power of its age, the number of those after it.
+        Whether an episode counts `FADING` to the power of its age, the number of recordings after
+        its own.
+    recordings
+        Number of the recording that each of the n episodes is a window of; empty where each is one.
+    recording_count
+        Number of all recordings, those that standardize the scores included; 0 for one an episode.
 
     Examples
     --------
@@ -145,9 +159,16 @@ class Calibration:
     largest: tuple[float, ...]
     episodes: int
     rolling: bool = False
+    recordings: tuple[int, ...] = ()
+    recording_count: int = 0
 
     @classmethod
-    def fit(cls, scores: Sequence[Floats], kind: AlarmKind = "cusum") -> "Calibration":
+    def fit(
+        cls,
+        scores: Sequence[Floats],
+        kind: AlarmKind = "cusum",
+        recordings: Sequence[Hashable] | None = None,
+    ) -> "Calibration":
         """Take the scores of calibration episodes.
 
         Parameters
@@ -156,46 +177,90 @@ class Calibration:
             By episode.
         kind
             See `GuaranteedAlarm.fit`.
+        recordings
+            For each episode the recording that it is a window of; None where each is one. Windows
+            of one recording have the weight of one episode together, and for a CUSUM the recordings
+            number 0, 2, 4, ... standardize. Levels that recordings are too few for count windows.
 
         Returns
         -------
         Calibration
         """
-        standardization, episodes = None, scores
+        numbers = numbered(recordings, len(scores))
+        count = len({*numbers.tolist()})
+        standardization, episodes = None, np.arange(len(scores))
         if kind == "cusum":
-            standardization, episodes = Standardization.fit(scores[0::2]), scores[1::2]
+            standardizing, episodes = halves(numbers)
+            standardization = Standardization.fit([scores[i] for i in standardizing])
         unbounded = GuaranteedAlarm(standardization, math.inf)
-        largest = tuple(unbounded.largest(episode) for episode in episodes)
-        return cls(kind, standardization, largest, len(scores))
+        largest = tuple(unbounded.largest(scores[i]) for i in episodes)
+        if recordings is None:
+            return cls(kind, standardization, largest, len(scores))
+        of_largest = tuple(numbers[episodes].tolist())
+        return cls(
+            kind,
+            standardization,
+            largest,
+            len(scores),
+            recordings=of_largest,
+            recording_count=count,
+        )
 
     @property
     def unbounded(self) -> GuaranteedAlarm:
         """The statistic, with a threshold that nothing exceeds."""
         return GuaranteedAlarm(self.standardization, math.inf)
 
-    def joined(self, largest: float) -> "Calibration":
+    def joined(self, largest: float, recording: int | None = None) -> "Calibration":
         """Return a rolling calibration with a further nominal episode.
 
         Parameters
         ----------
         largest
             Its largest statistic.
+        recording
+            Number of the recording that it is a window of; by default it is one of its own.
 
         Returns
         -------
         Calibration
         """
+        numbers = self.numbers
+        number = max(numbers, default=-1) + 1 if recording is None else recording
+        is_new = number not in numbers
+        recordings = () if is_new and not self.recordings else (*numbers, number)
         return replace(
-            self, largest=(*self.largest, largest), episodes=self.episodes + 1, rolling=True
+            self,
+            largest=(*self.largest, largest),
+            episodes=self.episodes + 1,
+            rolling=True,
+            recordings=recordings,
+            recording_count=(self.recording_count or self.episodes) + is_new if recordings else 0,
         )
+
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        """Number of the recording of each of the n episodes."""
+        return self.recordings or tuple(range(len(self.largest)))
+
+    def no_promise(self, level: float, confidence: float | None = None) -> str:
+        """Return why a threshold of a level promises nothing: see `no_promise`."""
+        if not self.recordings:
+            return ""
+        n = len({*self.recordings})
+        if self.rolling and n < (least := least_rolling(level)):
+            return _no_promise(self.episodes, self.recording_count, level, least)
+        count = self.recording_count
+        return no_promise(self.episodes, count, level, self.kind, confidence)
 
     def threshold(self, level: float, confidence: float | None = None) -> float:
         """Return the threshold of a level; infinite where no number could promise it.
 
-        Of a rolling calibration it is the smallest statistic up to which the episodes have a share
-        of at least ``1 - level`` of all weights, to which the episode to come, whose statistic may
-        be anything, adds 1 (Barber et al., "Conformal prediction beyond exchangeability", Ann.
-        Statist. 51, 2023).
+        It is the smallest statistic up to which the episodes have a share of at least ``1 - level``
+        of all weights, to which the recording to come, whose statistic may be anything, adds 1:
+        with one episode a recording a rank, see `quantile_rank`. A rolling calibration fades
+        weights (Barber et al., "Conformal prediction beyond exchangeability", Ann. Statist. 51,
+        2023). With a confidence it is the rank among the largest statistics of recordings.
 
         Parameters
         ----------
@@ -206,14 +271,22 @@ class Calibration:
         -------
         float
         """
-        n, ordered = len(self.largest), np.sort(self.largest)
-        if not self.rolling:
+        # Where recordings are too few for the level, their windows count, and nothing is promised.
+        counts_windows = bool(self.no_promise(level, confidence))
+        units = range(len(self.largest)) if counts_windows else self.numbers
+        present, unit = np.unique(np.array(units, np.intp), return_inverse=True)
+        n = len(present)
+        if confidence is not None:
+            tops = np.full(n, -math.inf)
+            np.maximum.at(tops, unit, self.largest)
             rank = quantile_rank(n, level, confidence)
-            return float(ordered[rank - 1]) if rank <= n else math.inf
-        weights = FADING ** np.arange(n - 1, -1, -1.0)
-        up_to = np.cumsum(weights[np.argsort(self.largest, kind="stable")])
+            return float(np.sort(tops)[rank - 1]) if rank <= n else math.inf
+        ages = np.arange(n - 1, -1, -1.0)
+        weights = FADING**ages if self.rolling else np.ones(n)
+        order = np.argsort(self.largest, kind="stable")
+        up_to = np.cumsum((weights[unit] * window_weights(unit))[order])
         enough = up_to >= (1 - level) * (weights.sum() + 1) - _ROUNDING
-        return float(ordered[enough.argmax()]) if enough.any() else math.inf
+        return float(self.largest[order[enough.argmax()]]) if enough.any() else math.inf
 
     def rule(self, level: float, confidence: float | None = None) -> GuaranteedAlarm:
         """Return the alarm of a level.
@@ -268,6 +341,103 @@ def least_rolling(level: float) -> float:
     return math.ceil(math.log(left) / math.log(FADING) - _ROUNDING) if left > 0 else math.inf
 
 
+def numbered(recordings: Sequence[Hashable] | None, episodes: int) -> NDArray[np.intp]:
+    """Return the number of each episode's recording, in the order in which they begin.
+
+    >>> numbered(["b", "a", "b"], 3).tolist(), numbered(None, 3).tolist()
+    ([0, 1, 0], [0, 1, 2])
+    """
+    if recordings is None:
+        return np.arange(episodes)
+    if len(recordings) != episodes:
+        raise UsageError(
+            f"{len(recordings)} recordings of {episodes} episodes, expected one for each: the "
+            "recording that it is a window of"
+        )
+    numbers = {recording: i for i, recording in enumerate(dict.fromkeys(recordings))}
+    return np.array([numbers[recording] for recording in recordings], np.intp)
+
+
+def window_weights(numbers: NDArray[np.intp]) -> Floats:
+    """Return weights of episodes that sum to 1 over the windows of each recording.
+
+    >>> window_weights(np.array([0, 1, 1])).tolist()
+    [1.0, 0.5, 0.5]
+    """
+    _, unit, counts = np.unique(numbers, return_inverse=True, return_counts=True)
+    weights: Floats = 1 / counts[unit]
+    return weights
+
+
+def halves(numbers: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return which episodes standardize the scores of a CUSUM, and which give its threshold.
+
+    Recordings number 0, 2, 4, ... standardize, or the others where these would leave less than half
+    of the windows for the threshold. Windows of a single recording alternate.
+
+    Parameters
+    ----------
+    numbers
+        Number of each episode's recording.
+
+    Returns
+    -------
+    tuple
+        Indices of episodes.
+
+    Examples
+    --------
+    >>> [half.tolist() for half in halves(np.array([0, 0, 1, 1, 2]))]
+    [[0, 1, 4], [2, 3]]
+    """
+    several = len({*numbers.tolist()}) > 1
+    is_odd = (numbers if several else np.arange(len(numbers))) % 2 == 1
+    if np.count_nonzero(is_odd) < len(numbers) // 2:
+        is_odd = ~is_odd
+    return np.flatnonzero(~is_odd), np.flatnonzero(is_odd)
+
+
+def no_promise(
+    windows: int, recordings: int, level: float, kind: AlarmKind, confidence: float | None = None
+) -> str:
+    """Say that windows of so few recordings promise nothing at a level; empty where they do.
+
+    Parameters
+    ----------
+    windows, recordings
+        Numbers of calibration episodes and of the recordings that they are windows of, those that
+        standardize the scores included.
+    level
+        Largest share of nominal episodes with an alarm.
+    kind, confidence
+        See `GuaranteedAlarm.fit`.
+
+    Returns
+    -------
+    str
+        Empty, too, where each episode is one recording, which `too_few` is for.
+
+    Examples
+    --------
+    >>> no_promise(38, 1, 0.10, "score")
+    '38 windows of 1 recording: no promise at 10 %; 9 recordings would'
+    >>> no_promise(38, 18, 0.10, "cusum"), no_promise(17, 17, 0.10, "cusum")
+    ('', '')
+    """
+    least = least_episodes(level, kind, confidence)
+    return (
+        _no_promise(windows, recordings, level, least) if recordings < min(windows, least) else ""
+    )
+
+
+def _no_promise(windows: int, recordings: int, level: float, least: float) -> str:
+    would = f"{least:g} recordings would" if math.isfinite(least) else "no number of them would"
+    return (
+        f"{counted(windows, 'window(s)')} of {counted(recordings, 'recording(s)')}: no promise at "
+        f"{100 * level:.3g} %; {would}"
+    )
+
+
 def too_few(
     subject: str, episodes: int, level: float, kind: AlarmKind, confidence: float | None = None
 ) -> str:
@@ -319,7 +489,10 @@ def missing_level(episodes: int, level: float, kind: AlarmKind) -> str:
 
 
 def rolling_rules(
-    calibration: Calibration, nominal: Sequence[Floats], level: float
+    calibration: Calibration,
+    nominal: Sequence[Floats],
+    level: float,
+    recordings: Sequence[int] | None = None,
 ) -> list[GuaranteedAlarm]:
     """Return the alarms of a rolling calibration, one for each nominal episode and one for after.
 
@@ -334,6 +507,8 @@ def rolling_rules(
         Scores of the m nominal episodes, in the order in which they were recorded.
     level
         Largest share of nominal episodes with an alarm.
+    recordings
+        Numbers of their recordings, on from those of the calibration; None where each is one.
 
     Returns
     -------
@@ -346,8 +521,9 @@ def rolling_rules(
         Where a threshold would be infinite.
     """
     rules = [calibration.rule(level)]
-    for scores in nominal:
-        calibration = calibration.joined(calibration.unbounded.largest(scores))
+    for i, scores in enumerate(nominal):
+        recording = None if recordings is None else int(recordings[i])
+        calibration = calibration.joined(calibration.unbounded.largest(scores), recording)
         rules.append(calibration.rule(level))
     return rules
 

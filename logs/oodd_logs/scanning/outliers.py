@@ -5,6 +5,9 @@ episodes are tested against one another: the k-th smallest of n such p-values is
 median a p-value is therefore read from a tail, whose shape is assumed: how rare false discoveries
 are then is known from simulations and is no guarantee. Ranks among episodes that are kept apart are
 p-values whatever the distribution, and with enough of these nothing has to be assumed.
+
+Windows of one recording count once: they have weights that sum to 1, and n is the number of
+recordings.
 """
 
 import math
@@ -49,34 +52,41 @@ class Tail:
 
     start: float
     share: float
-    estimates: tuple[tuple[float, int], ...]
+    estimates: tuple[tuple[float, float], ...]
 
     @classmethod
-    def fit(cls, others: Floats) -> "Tail | None":
+    def fit(cls, others: Floats, weights: Floats | None = None) -> "Tail | None":
         """Estimate the tail; None where there are too few episodes, or ties leave no spread.
 
         Parameters
         ----------
         others : float64 array of shape (n,)
             Largest statistic of each other episode.
+        weights : float64 array of shape (n,), optional
+            Of these, 1 for one episode a recording; by default all 1.
 
         Returns
         -------
         Tail or None
         """
-        ordered, n = np.sort(others), len(others)
-        middle = (n + 1) // 2
+        order = np.argsort(others, kind="stable")
+        ordered = others[order]
+        weighed = np.ones(len(others)) if weights is None else weights[order]
+        n, up_to = round(weighed.sum()), np.cumsum(weighed)
+        middle = int(np.searchsorted(up_to, (n + 1) // 2 - _ROUNDING)) + 1
         if n + 1 < LEAST or not math.isfinite(ordered[middle - 1]):
             return None
-        start = float(ordered[middle - 1])
-        amounts = np.cbrt(ordered[middle:]) - np.cbrt(start)
+        start, below = float(ordered[middle - 1]), float(up_to[middle - 1])
+        amounts, beyond = np.cbrt(ordered[middle:]) - np.cbrt(start), up_to[middle:] - below
         estimates = []
-        for r in (len(amounts), math.floor((1 - ODD_SHARE) * n) - middle):
+        for most in (n - below, math.floor((1 - ODD_SHARE) * n) - below):
+            seen = int(np.searchsorted(beyond, most + _ROUNDING, side="right"))
             # Of a censored amount is known that it is at least the largest other.
-            if 0 < (largest := float(amounts[r - 1])) < math.inf:
-                total = float(amounts[:r].sum()) + (len(amounts) - r) * largest
+            if seen and 0 < (largest := float(amounts[seen - 1])) < math.inf:
+                r = float(beyond[seen - 1])
+                total = float((weighed[middle:] * amounts)[:seen].sum()) + (n - below - r) * largest
                 estimates.append((total / r, r))
-        share = (n + 1 - middle) / (n + 1)
+        share = (n + 1 - below) / (n + 1)
         return cls(start, share, tuple(estimates)) if estimates else None
 
     def p(self, largest: float) -> float:
@@ -115,24 +125,28 @@ class Tail:
         return float((np.cbrt(self.start) + max(amount, 0.0)) ** 3)
 
 
-def rank_p(largest: float, others: Floats) -> float:
+def rank_p(largest: float, others: Floats, weights: Floats | None = None) -> float:
     """Return the conformal p-value: a rank among the others, ties counted against the episode.
 
     >>> rank_p(3.0, np.array([1.0, 2.0, 3.0]))
     0.5
     """
-    return float((1 + np.count_nonzero(others >= largest)) / (len(others) + 1))
+    weighed = np.ones(len(others)) if weights is None else weights
+    return float((1 + weighed[others >= largest].sum()) / (weighed.sum() + 1))
 
 
-def rank_threshold(p: float, others: Floats) -> float:
+def rank_threshold(p: float, others: Floats, weights: Floats | None = None) -> float:
     """Return the least statistic whose rank among the others is a p-value of at most this.
 
     >>> others = np.array([1.0, 2.0, 3.0])
     >>> rank_p(rank_threshold(0.5, others), others), rank_p(2.0, others)
     (0.5, 0.75)
     """
-    above = math.floor(p * (len(others) + 1) + _ROUNDING) - 1
-    return float(np.nextafter(np.sort(others)[-1 - above], np.inf)) if above >= 0 else math.inf
+    order = np.argsort(-others, kind="stable")
+    from_top = np.cumsum(np.ones(len(others)) if weights is None else weights[order])
+    most = p * (from_top[-1] + 1) - 1 + _ROUNDING
+    above = int(np.searchsorted(from_top, most, side="right"))
+    return float(np.nextafter(others[order][above], np.inf)) if most >= 0 else math.inf
 
 
 def q_values(p: Floats) -> Floats:

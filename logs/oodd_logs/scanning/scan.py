@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from multiprocessing import get_context
-from typing import Any, Final, cast
+from typing import Any, Final, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,7 +23,7 @@ from oodd_eval.data.bounded import without_nan
 from oodd_eval.data.facts import roles_of
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import ContractError, OoddError, UnknownNameError, UsageError
-from oodd_eval.metrics.alarms import AlarmKind, GuaranteedAlarm
+from oodd_eval.metrics.alarms import AlarmKind, GuaranteedAlarm, numbered, window_weights
 from oodd_eval.metrics.cusum import Standardization
 from oodd_eval.names import counted
 from oodd_eval.plugins.contract import AnyDetector
@@ -323,18 +323,25 @@ def scan_episodes(
         judged.append(_Judged(episode, *answer, trajectories[i], baseline))
     how = "each episode is judged by a fit that has not seen it."
     notes.insert(0, f"{counted(len(usable), 'episode(s)')}, {counted(len(folds), 'fit(s)')}: {how}")
+    recordings = len({episode.recording for episode in usable})
+    if recordings < min(len(usable), LEAST):
+        windows = f"{len(usable)} windows of {counted(recordings, 'recording(s)')}"
+        notes.append(
+            f"{windows}: they are judged as if each were a recording, and no false discovery rate "
+            f"is kept; {LEAST} recordings would do."
+        )
     name = handle.state["name"] or type(handle.detector).__name__
     return _verdict(judged, names, _Terms(f"{name}, fitted on the other episodes", fdr, notes))
 
 
 def _as_episode(episode: Episode | ArrayLike, number: int) -> Episode:
     if isinstance(episode, Episode):
-        return episode
+        return episode if episode.recording is not None else replace(episode, recording=number)
     rows = np.asarray(episode, dtype=np.float64)
     if rows.ndim != 2 or 0 in rows.shape:
         raise UsageError(f"episode {number} has shape {rows.shape}, expected (rows, sensors)")
     name = f"episode {number}"
-    return Episode(name, name, rows, np.empty((len(rows) - 1, 0)), None)
+    return Episode(name, name, rows, np.empty((len(rows) - 1, 0)), None, recording=number)
 
 
 def _cut(episodes: list[Episode], window: int | None) -> tuple[list[Episode], list[str]]:
@@ -388,8 +395,9 @@ def _scan_with(
     )
     terms = _Terms("a watchdog", fdr, notes, watchdog.rule.threshold)
     if (calibration := watchdog.calibration) is not None:
-        enough = (len(calibration.largest) + 1) * fdr >= len(episodes)
-        reference = np.array(calibration.largest)
+        weights = window_weights(np.array(calibration.numbers, np.intp))
+        reference = _Reference(np.array(calibration.largest), weights)
+        enough = (reference.count + 1) * fdr >= len(episodes)
         terms = replace(terms, reference=reference, exact=enough and not calibration.rolling)
     return _verdict(judged, watchdog.sensors, terms)
 
@@ -513,27 +521,37 @@ class _Terms:
     fdr: float
     notes: list[str]
     limit: float = math.nan
-    reference: Floats | None = None
+    reference: "_Reference | None" = None
     exact: bool = False
+
+
+class _Reference(NamedTuple):
+    """Largest statistics that one is compared with, and their weights: see `window_weights`."""
+
+    largest: Floats
+    weights: Floats
+
+    @property
+    def count(self) -> int:
+        return round(self.weights.sum())
 
 
 def _verdict(judged: Sequence[_Judged], names: Sequence[str], terms: _Terms) -> Scan:
     """Compare the episodes' largest statistics, and look for rows and sensors."""
     episodes = [judgement.episode for judgement in judged]
     largest = np.array([np.nanmax(judgement.statistic, initial=-math.inf) for judgement in judged])
-    references = [
-        largest[_peers(episodes, i)] if terms.reference is None else terms.reference
-        for i in range(len(episodes))
-    ]
-    tails = [Tail.fit(reference) for reference in references]
+    references = [terms.reference] * len(episodes) if terms.reference else []
+    for i in range(len(episodes) if terms.reference is None else 0):
+        references.append(_reference(largest, episodes, i))
+    tails = [Tail.fit(*reference) for reference in references]
     ranks = np.array(
-        [rank_p(x, reference) for x, reference in zip(largest, references, strict=True)]
+        [rank_p(x, *reference) for x, reference in zip(largest, references, strict=True)]
     )
     p = ranks.copy()
     for i, tail in enumerate(tails):
         if tail is not None and largest[i] > tail.start and not terms.exact:
             p[i] = tail.p(largest[i])
-    fewest = min(map(len, references)) + 1
+    fewest = min(reference.count for reference in references) + 1
     notes, has_p_values = [*terms.notes], fewest >= LEAST
     if not has_p_values:
         p[:] = math.nan
@@ -559,7 +577,7 @@ def _verdict(judged: Sequence[_Judged], names: Sequence[str], terms: _Terms) -> 
         if has_p_values:
             threshold = math.nan if tail is None else tail.threshold(critical)
             if terms.exact:
-                threshold = rank_threshold(critical, references[i])
+                threshold = rank_threshold(critical, *references[i])
         rejected = bool(q[i] <= terms.fdr if has_p_values else largest[i] > terms.limit)
         # Rounding of the threshold may leave nothing but the largest statistic.
         above = runs_of(rejected & (judgement.statistic >= np.fmin(threshold, largest[i])))
@@ -598,6 +616,16 @@ def _peers(episodes: Sequence[Episode], i: int) -> list[int]:
     candidates = [j for j in range(len(episodes)) if j != i]
     same = [j for j in candidates if episodes[j].task == episodes[i].task]
     return same if len(same) + 1 >= LEAST else candidates
+
+
+def _reference(largest: Floats, episodes: Sequence[Episode], i: int) -> _Reference:
+    """Return the peers' statistics: of other recordings where these suffice, else of windows."""
+    peers = _peers(episodes, i)
+    others = [j for j in peers if episodes[j].recording != episodes[i].recording]
+    numbers = numbered([episodes[j].recording for j in others], len(others))
+    if len({*numbers.tolist()}) + 1 < LEAST:
+        return _Reference(largest[peers], np.ones(len(peers)))
+    return _Reference(largest[others], window_weights(numbers))
 
 
 def _statistic(kind: AlarmKind, scores: Sequence[Floats], peers: Sequence[int], i: int) -> Floats:
