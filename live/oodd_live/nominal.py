@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from oodd_eval.data.baseline import Baseline, check_baseline, episode_means
 from oodd_eval.data.facts import roles_of
 from oodd_eval.data.offsets import fit_offsets
-from oodd_eval.data.parts import CALIBRATION, EnvironmentData
+from oodd_eval.data.parts import CALIBRATION, TRAIN, TWINS, EnvironmentData
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import TrajectoryError, UsageError
 from oodd_eval.metrics.promise import EpisodeMeans, PromiseFinding, promises
@@ -81,6 +81,8 @@ class NominalData:
         Whether the order of episodes is that in which they were recorded.
     recordings
         For each calibration episode the recording that it is a window of; None where each is one.
+    other_recordings
+        Those of the training episodes and of the further ones.
     """
 
     train: list[Trajectory]
@@ -90,6 +92,7 @@ class NominalData:
     rate: float | None
     recorded: bool
     recordings: Sequence[Hashable] | None = None
+    other_recordings: Sequence[Sequence[Hashable] | None] = (None, None)
 
     @classmethod
     def of(
@@ -105,7 +108,7 @@ class NominalData:
     ) -> Self:
         """Take the arguments of `Watchdog.fit`; what is None is a split's own, if it has it."""
         further: list[Trajectory] = []
-        recorded = True
+        recorded, others = True, (None, None)
         if isinstance(train, EnvironmentData):
             if calibration is not None:
                 raise UsageError(
@@ -115,6 +118,7 @@ class NominalData:
             data, facts = train, train.logs
             train, calibration, sensors = data.train, data.calibration, sensors or data.sensors
             recordings = data.recordings(CALIBRATION) if recordings is None else recordings
+            others = data.recordings(TRAIN), data.recordings(TWINS)
             recorded = facts is not None and facts.order == "recorded"
             if facts is not None:
                 further, rate = list(data.twins), rate or facts.rate
@@ -139,13 +143,17 @@ class NominalData:
             check_baseline(map(len, calibrating), rows, "calibration")
         base = Baseline.fit(training, rows) if rows else None
         nominal = Nominal(names, subtracted, base, roles_of(sensors or ()))
-        return cls(training, calibrating, further, nominal, rate, recorded, recordings)
+        return cls(training, calibrating, further, nominal, rate, recorded, recordings, others)
 
     def findings(self) -> list[PromiseFinding]:
         """Return what was tested about the promise."""
         base = self.nominal.baseline
         parts = (self.train, self.calibration, self.further)
-        train, calibration, further = (EpisodeMeans(*episode_means(x, base)) for x in parts)
+        recordings = self.other_recordings[0], self.recordings, self.other_recordings[1]
+        train, calibration, further = (
+            EpisodeMeans(*episode_means(episodes, base), of_part)
+            for episodes, of_part in zip(parts, recordings, strict=True)
+        )
         tested = promises(
             train, calibration, further, sensors=self.nominal.sensors, recorded=self.recorded
         )

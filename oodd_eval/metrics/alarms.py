@@ -398,7 +398,13 @@ def halves(numbers: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp
 
 
 def no_promise(
-    windows: int, recordings: int, level: float, kind: AlarmKind, confidence: float | None = None
+    windows: int,
+    recordings: int,
+    level: float,
+    kind: AlarmKind,
+    confidence: float | None = None,
+    *,
+    rolling: bool = False,
 ) -> str:
     """Say that windows of so few recordings promise nothing at a level; empty where they do.
 
@@ -411,6 +417,8 @@ def no_promise(
         Largest share of nominal episodes with an alarm.
     kind, confidence
         See `GuaranteedAlarm.fit`.
+    rolling
+        Whether the calibration is to be a rolling one, which takes more.
 
     Returns
     -------
@@ -424,10 +432,11 @@ def no_promise(
     >>> no_promise(38, 18, 0.10, "cusum"), no_promise(17, 17, 0.10, "cusum")
     ('', '')
     """
-    least = least_episodes(level, kind, confidence)
-    return (
-        _no_promise(windows, recordings, level, least) if recordings < min(windows, least) else ""
-    )
+    least: float = least_episodes(level, kind, confidence)
+    if rolling:
+        least = least_rolling(level) * (1 if kind == "score" else 2)
+    is_enough = recordings >= min(windows, least)
+    return "" if is_enough else _no_promise(windows, recordings, level, least)
 
 
 def _no_promise(windows: int, recordings: int, level: float, least: float) -> str:
@@ -458,7 +467,9 @@ def too_few(
     )
 
 
-def missing_level(episodes: int, level: float, kind: AlarmKind) -> str:
+def missing_level(
+    episodes: int, level: float, kind: AlarmKind, recordings: int | None = None
+) -> str:
     """Say how many calibration episodes a level takes, and which weaker level these offer.
 
     Parameters
@@ -469,6 +480,8 @@ def missing_level(episodes: int, level: float, kind: AlarmKind) -> str:
         Largest share of nominal episodes with an alarm, which they are too few for.
     kind
         The statistic.
+    recordings
+        Number of the recordings that the episodes are windows of; by default as many.
 
     Returns
     -------
@@ -485,7 +498,10 @@ def missing_level(episodes: int, level: float, kind: AlarmKind) -> str:
     weaker = [share for share in offered_levels(episodes, kind).values() if share > level]
     remedy = f", or --level {100 * min(weaker):g}" if weaker else ""
     needed = f"{least_episodes(level, kind)} needed at {100 * level:g} %"
-    return f"{episodes} calibration episodes; {needed}{remedy}"
+    of_recordings = ""
+    if recordings is not None and recordings < episodes:
+        of_recordings = f", windows of {counted(recordings, 'recording(s)')}"
+    return f"{episodes} calibration episodes{of_recordings}; {needed}{remedy}"
 
 
 def rolling_rules(

@@ -41,6 +41,9 @@ class Contribution:
     deviations
         Of the value in each resample of the calibration episodes from its mean over these: shape
         (draws,). Empty where none changes it, or it is not known.
+    recordings
+        Without twins, number of the recording that each episode is a window of; empty where each is
+        one.
 
     Examples
     --------
@@ -54,6 +57,7 @@ class Contribution:
     median: bool = False
     nominal: int | None = None
     deviations: Floats = field(default_factory=lambda: np.zeros(0))
+    recordings: tuple[int, ...] = ()
 
     @cached_property
     def value(self) -> float:

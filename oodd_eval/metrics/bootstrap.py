@@ -228,10 +228,43 @@ def drawn_cell(
     environment: str, seed: int, contribution: Contribution, condition: str = ""
 ) -> DrawnCells:
     """Return one cell of a detector seed; the condition matters where episodes have no twins."""
-    terms = contribution.numerator[None], contribution.denominator[None]
-    median, nominal = contribution.median, contribution.nominal
-    deviations = [contribution.deviations]
+    both = np.array([[contribution.numerator], [contribution.denominator]])
+    terms, nominal = sums_of_recordings(both, contribution.nominal, contribution.recordings)
+    median, deviations = contribution.median, [contribution.deviations]
     return DrawnCells(environment, [seed], *terms, median, nominal, condition, deviations)
+
+
+def sums_of_recordings(
+    terms: Floats, nominal: int | None, recordings: Sequence[int]
+) -> tuple[Floats, int | None]:
+    """Return the sums of terms over the windows of each recording, which is drawn as one.
+
+    Parameters
+    ----------
+    terms
+        Shape (..., n), those of nominal test episodes first.
+    nominal
+        The number of these; None where episodes have twins.
+    recordings
+        See `Contribution`.
+
+    Returns
+    -------
+    tuple
+        Sums of shape (..., recordings), and the number of those that are nominal. Windows of a
+        sample's only recording stay: it says nothing of others.
+    """
+    if nominal is None or not recordings:
+        return terms, nominal
+    sums = []
+    for part in (slice(nominal), slice(nominal, None)):
+        present, unit = np.unique(np.array(recordings[part], np.intp), return_inverse=True)
+        if len(present) == 1:
+            present = unit = np.arange(len(unit))
+        of_part = np.zeros((*terms.shape[:-1], len(present)))
+        np.add.at(of_part, (..., unit), terms[..., part])
+        sums.append(of_part)
+    return np.concatenate(sums, axis=-1), sums[0].shape[-1]
 
 
 def mean_interval(cells: Sequence[DrawnCells], *, kind: IntervalKind) -> tuple[float, float]:
@@ -435,7 +468,8 @@ def _exact(cells: Sequence[DrawnCells]) -> tuple[float, float]:
         terms = (x.sum(axis=1).tolist() for x in (c.numerators, c.denominators))
         for seed, size, *both in zip(c.seeds, c.sizes, *terms, strict=True):
             if size:
-                counts.setdefault(c.environment, {})[seed] = both[0], both[1]
+                # Windows of one recording count as one, with the share that alarms.
+                counts.setdefault(c.environment, {})[seed] = both[0] * (size / both[1]), float(size)
     alarmed, episodes = (
         math.fsum(sum(pair[i] for pair in seeds.values()) / len(seeds) for seeds in counts.values())
         for i in (0, 1)

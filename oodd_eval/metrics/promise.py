@@ -2,11 +2,12 @@
 
 The promise holds for episodes that are exchangeable with those of the calibration: for as many as
 the level takes, of a machine that does not drift, as long as those that are judged. Whether it
-drifts is tested by permutations of the recorded order, without a detector.
+drifts is tested by permutations of the recorded order, without a detector. Windows of one recording
+count once.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple
 
@@ -18,7 +19,10 @@ from oodd_eval.metrics.alarms import (
     AlarmKind,
     Calibration,
     least_episodes,
+    no_promise,
+    numbered,
     offered_levels,
+    window_weights,
 )
 from oodd_eval.metrics.catalogue import HEADLINE, LEVELS
 
@@ -197,10 +201,28 @@ class EpisodeMeans(NamedTuple):
         Float64 array of shape (n, D).
     lengths
         Int64 array of shape (n,).
+    recordings
+        For each episode the recording that it is a window of; None where each is one.
     """
 
     means: Floats
     lengths: NDArray[np.int64]
+    recordings: Sequence[Hashable] | None = None
+
+    @property
+    def count(self) -> int:
+        """Number of recordings."""
+        return len(self.lengths) if self.recordings is None else len({*self.recordings})
+
+    def by_recording(self) -> "EpisodeMeans":
+        """Return the means of recordings."""
+        unit = numbered(self.recordings, len(self.lengths))
+        share = window_weights(unit)
+        means = np.zeros((self.count, self.means.shape[1]))
+        lengths = np.zeros(self.count)
+        np.add.at(means, unit, self.means * share[:, None])
+        np.add.at(lengths, unit, self.lengths * share)
+        return EpisodeMeans(means, np.rint(lengths).astype(np.int64))
 
 
 NO_EPISODES: Final = EpisodeMeans(np.empty((0, 0)), np.empty(0, np.int64))
@@ -233,11 +255,15 @@ def promises(
     list of PromiseFinding
         The number of episodes first, then what was tested.
     """
-    findings = [enough_episodes(len(calibration.lengths), kinds)]
+    findings = [enough_episodes(len(calibration.lengths), kinds, calibration.count)]
+    parts, noun = [train, calibration, nominal], "episodes"
+    if FEWEST <= sum(part.count for part in parts) < sum(len(part.lengths) for part in parts):
+        parts, noun = [part.by_recording() for part in parts], "recordings"
+        train, calibration, nominal = parts
     if recorded:
-        parts = [part.means for part in (train, calibration, nominal) if len(part.means)]
-        every = np.concatenate(parts) if parts else NO_EPISODES.means
-        findings.append(_drift(drift_test(every), len(every), sensors))
+        means = [part.means for part in parts if len(part.means)]
+        every = np.concatenate(means) if means else NO_EPISODES.means
+        findings.append(_drift(drift_test(every), len(every), noun, sensors))
     if len(calibration.means) and len(nominal.means):
         test = two_sample_test(calibration.means, nominal.means)
         findings.append(_difference(test, sensors))
@@ -245,7 +271,9 @@ def promises(
     return findings
 
 
-def enough_episodes(n: int, kinds: Sequence[AlarmKind] = STATISTICS) -> PromiseFinding:
+def enough_episodes(
+    n: int, kinds: Sequence[AlarmKind] = STATISTICS, recordings: int | None = None
+) -> PromiseFinding:
     """Tell which levels a number of calibration episodes is enough for.
 
     Parameters
@@ -254,6 +282,8 @@ def enough_episodes(n: int, kinds: Sequence[AlarmKind] = STATISTICS) -> PromiseF
         Number of calibration episodes.
     kinds
         Statistics.
+    recordings
+        Number of the recordings that these are windows of; by default as many.
 
     Returns
     -------
@@ -265,16 +295,30 @@ def enough_episodes(n: int, kinds: Sequence[AlarmKind] = STATISTICS) -> PromiseF
     >>> print(enough_episodes(30))
     30 calibration episodes: at 5 % 38 are needed for a CUSUM of the scores, 19 for a detector's \
 own score
+    >>> print(enough_episodes(38, ["score"], 1))
+    38 windows of 1 recording: no promise at 10 %; 9 recordings would
     """
-    offered = [offered_levels(n, kind) for kind in kinds]
+    units = n if recordings is None else min(n, recordings)
+    offered = [offered_levels(units, kind) for kind in kinds]
     missing = next((s for s in LEVELS if not all(s in levels for levels in offered)), None)
+    doubt = not all(HEADLINE in levels for levels in offered)
     text = f"{n} calibration episodes: enough for all levels"
+    if units < n:
+        text = f"{n} windows of {units} recordings: enough for all levels"
     if missing is not None:
         level = LEVELS[missing]
-        needed = [f"{least_episodes(level, kind)} {{}}for {_name(kind)}" for kind in kinds]
+        least = {kind: least_episodes(level, kind) for kind in kinds}
+        needed = [f"{number} {{}}for {_name(kind)}" for kind, number in least.items()]
         listed = ", ".join(needed).replace("{}", "are needed ", 1).replace("{}", "")
         text = f"{n} calibration episodes: at {100 * level:g} % {listed}"
-    return PromiseFinding("episodes", text, not all(HEADLINE in levels for levels in offered))
+        if units < n:
+            lacking = sorted((kind for kind in kinds if least[kind] > units), key=least.__getitem__)
+            text = no_promise(n, units, level, lacking[0])
+            if len(lacking) < len(kinds):
+                text += f" for {_name(lacking[0])}"
+            elif len(lacking) > 1:
+                text += f" ({least[lacking[1]]} for {_name(lacking[1])})"
+    return PromiseFinding("episodes", text, doubt)
 
 
 def _name(kind: AlarmKind) -> str:
@@ -282,7 +326,10 @@ def _name(kind: AlarmKind) -> str:
 
 
 def achieved_share(
-    calibration: Sequence[Floats], kind: AlarmKind, name: str = ""
+    calibration: Sequence[Floats],
+    kind: AlarmKind,
+    name: str = "",
+    recordings: Sequence[Hashable] | None = None,
 ) -> PromiseFinding | None:
     """Tell how many later calibration episodes alarm at a threshold from the earlier ones.
 
@@ -294,12 +341,21 @@ def achieved_share(
         The statistic.
     name
         Of the detector.
+    recordings
+        What the episodes are windows of; where there are enough of them, each is taken whole.
 
     Returns
     -------
     PromiseFinding or None
         None where half of the episodes are too few for any level.
     """
+    unit, noun = numbered(recordings, len(calibration)), "episodes"
+    count = int(unit.max(initial=-1)) + 1
+    if count < len(calibration) and offered_levels(count // 2, kind):
+        whole = [
+            [s for s, i in zip(calibration, unit, strict=True) if i == k] for k in range(count)
+        ]
+        calibration, noun = [np.concatenate(windows) for windows in whole], "recordings"
     half = len(calibration) // 2
     offered = offered_levels(half, kind)
     if not offered:
@@ -313,7 +369,7 @@ def achieved_share(
     p = _beta_binomial_tail(alarms, len(later), math.floor((n + 1) * level + 1e-9), n)
     return PromiseFinding(
         "achieved",
-        f"{name}{': ' if name else ''}{alarms} of the {len(later)} later calibration episodes alarm"
+        f"{name}{': ' if name else ''}{alarms} of the {len(later)} later calibration {noun} alarm"
         f" at the threshold that the {half} earlier ones give for {100 * level:g} % (p = {p:.2g})",
         p <= SIGNIFICANT,
         p,
@@ -326,16 +382,16 @@ def _sensor(column: int, sensors: Sequence[str]) -> str:
     return sensors[column] if column < len(sensors) else f"sensor {column}"
 
 
-def _drift(test: PermutationTest, n: int, sensors: Sequence[str]) -> PromiseFinding:
+def _drift(test: PermutationTest, n: int, noun: str, sensors: Sequence[str]) -> PromiseFinding:
     sensor, figures = _sensor(test.column, sensors), _figures(test)
-    text = f"no drift seen in {n} nominal episodes: most in the mean of {sensor} ({figures})"
+    text = f"no drift seen in {n} nominal {noun}: most in the mean of {sensor} ({figures})"
     if test.significant:
         text = (
-            f"nominal episodes drift: the mean of {sensor} follows the order of all {n} ({figures})"
+            f"nominal {noun} drift: the mean of {sensor} follows the order of all {n} ({figures})"
             f", so that {_REMEDY}"
         )
     elif test.column < 0:
-        text = f"no drift: no sensor's mean varies over {n} nominal episodes"
+        text = f"no drift: no sensor's mean varies over {n} nominal {noun}"
     return PromiseFinding("drift", text, test.significant, test.p, sensor)
 
 

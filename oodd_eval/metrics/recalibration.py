@@ -12,12 +12,15 @@ of rank i among m, drawn with a number v uniform in [0, 1), has the level (i - 1
 become values by a line through the order statistics on the scale ``-log(1 - level)``, on which they
 lie at their expectations under an exponential tail (Rényi 1953); it goes on beyond the largest one
 with the mean excess of the upper ones as its slope.
+
+Where episodes are windows of several recordings, recordings are drawn, each with all its windows,
+which share its place among the m: there i and v count in shares of a recording.
 """
 
 import functools
 import math
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -27,9 +30,12 @@ from numpy.typing import NDArray
 from oodd_eval.metrics.alarms import (
     AlarmKind,
     GuaranteedAlarm,
+    halves,
+    no_promise,
+    numbered,
     offered_levels,
-    quantile_rank,
     start_terms,
+    window_weights,
 )
 from oodd_eval.metrics.auc import FAR_START
 from oodd_eval.metrics.cusum import DRIFT, THRESHOLD, UNIT, Standardization
@@ -46,31 +52,75 @@ Draws = dict[str, Floats]
 _STEEP: Final = 1e150  # units per score where scores do not vary: any rise is an alarm
 _NEVER: Final = -1e300  # a score that takes any sum back to 0
 _BLOCK: Final = 128  # episodes at a time
+_ROUNDING: Final = 1e-9  # of an episode
 
 
 class Drawn(NamedTuple):
     """Drawn episodes, and where each lies in the span of its rank: both of shape (draws, n).
 
-    Episodes of even and of odd number are drawn apart, each within themselves.
+    Draws of recordings differ in length, and are filled up with n. `halves` are the episodes that
+    standardize a CUSUM and those that its threshold is from, and `columns` those of their draws, as
+    each half is drawn within itself.
     """
 
     episodes: NDArray[np.intp]
     spread: Floats
+    halves: tuple[NDArray[np.intp], NDArray[np.intp]]
+    columns: tuple[NDArray[np.intp], NDArray[np.intp]]
 
-    def half(self, start: int) -> "Drawn":
-        """Return the draws of every second episode, numbered among these."""
-        return Drawn(self.episodes[:, start::2] // 2, self.spread[:, start::2])
+    def half(self, i: int) -> "Drawn":
+        """Return the draws of one half, numbered among its episodes."""
+        episodes, columns = self.halves[i], self.columns[i]
+        position = np.full(sum(map(len, self.halves)) + 1, len(episodes))
+        position[episodes] = np.arange(len(episodes))
+        return self._replace(
+            episodes=position[self.episodes[:, columns]], spread=self.spread[:, columns]
+        )
 
 
 @functools.lru_cache(maxsize=64)
-def drawn(environment: str, n: int) -> Drawn:
-    """Return the resamples of an environment's n calibration episodes."""
+def drawn(environment: str, n: int, recordings: tuple[int, ...] = ()) -> Drawn:
+    """Return the resamples of an environment's n calibration episodes.
+
+    Parameters
+    ----------
+    environment, n
+        The environment, and the number of episodes.
+    recordings
+        Number of each episode's recording, of several; empty where episodes are drawn.
+
+    Returns
+    -------
+    Drawn
+    """
     rng = np.random.default_rng([zlib.crc32(f"calibration of {environment}".encode()), n])
-    episodes = np.empty((DRAWS, n), np.intp)
-    for start in (0, 1):
-        size = len(range(start, n, 2))
-        episodes[:, start::2] = 2 * rng.integers(max(size, 1), size=(DRAWS, size)) + start
-    return Drawn(episodes, rng.random((DRAWS, n)))
+    numbers = np.array(recordings or range(n), np.intp)
+    two = halves(numbers)
+    windows = []
+    for half in two:
+        _, unit = np.unique(numbers[half], return_inverse=True)
+        size = int(unit.max(initial=-1)) + 1
+        units = rng.integers(max(size, 1), size=(DRAWS, size))
+        windows.append(_windows(units, [half[unit == k] for k in range(size)], n))
+    columns = np.arange(n)[0::2], np.arange(n)[1::2]
+    if recordings:
+        first, second = (part.shape[1] for part in windows)
+        columns = np.arange(first), np.arange(first, first + second)
+    episodes = np.empty((DRAWS, sum(map(len, columns))), np.intp)
+    for part, positions in zip(windows, columns, strict=True):
+        episodes[:, positions] = part
+    return Drawn(episodes, rng.random(episodes.shape), two, columns)
+
+
+def _windows(
+    units: NDArray[np.intp], members: Sequence[NDArray[np.intp]], n: int
+) -> NDArray[np.intp]:
+    """Return the episodes of drawn recordings, filled up with n."""
+    rows = [np.concatenate([np.zeros(0, np.intp), *(members[k] for k in draw)]) for draw in units]
+    episodes = np.full((len(rows), max(map(len, rows))), n)
+    for row, drawn_episodes in zip(episodes, rows, strict=True):
+        row[: len(drawn_episodes)] = drawn_episodes
+    return episodes
 
 
 class Standards(NamedTuple):
@@ -91,11 +141,14 @@ class Standards(NamedTuple):
         far = [s - centre for s in defined]
         largest = max(float(np.abs(x).max(initial=0.0)) for x in far)
         unit = math.ldexp(1.0, math.frexp(largest)[1] - 1) if largest else 1.0
-        sums = np.array([[x.size, (x / unit).sum(), ((x / unit) ** 2).sum()] for x in far])
+        sums = np.array(
+            [[x.size, (x / unit).sum(), ((x / unit) ** 2).sum()] for x in far] + [[0] * 3]
+        )
         size, first, second = sums[episodes].sum(axis=1).T
         size = np.where(size > 0, size, np.nan)
         variance = np.maximum(second / size - (first / size) ** 2, 0.0)
-        ends = np.array([[s.min(initial=np.inf), s.max(initial=-np.inf)] for s in defined])
+        none = np.zeros(0)
+        ends = np.array([[s.min(initial=np.inf), s.max(initial=-np.inf)] for s in [*defined, none]])
         low, high = ends[episodes, 0].min(axis=1), ends[episodes, 1].max(axis=1)
         equal = low == high
         mean = np.where(equal, low, centre + unit * (first / size))
@@ -112,8 +165,10 @@ class Standards(NamedTuple):
         return slope, slope * self.mean + DRIFT
 
 
-def thresholds(largest: Floats, draws: Drawn, rank: int) -> Floats:
-    """Return the drawn order statistics of a rank, from 1: shape (draws,).
+def thresholds(
+    largest: Floats, draws: Drawn, level: float, weights: Floats | None = None
+) -> Floats:
+    """Return the drawn thresholds of a level: shape (draws,).
 
     Parameters
     ----------
@@ -121,31 +176,46 @@ def thresholds(largest: Floats, draws: Drawn, rank: int) -> Floats:
         Largest statistics of the m episodes, in every draw: shape (draws, m).
     draws
         Of these episodes.
-    rank
-        That of the threshold.
+    level
+        Largest share of nominal episodes with an alarm.
+    weights
+        Of the episodes, see `oodd_eval.metrics.alarms.window_weights`; by default all 1.
 
     Returns
     -------
     float64 array
     """
     m = largest.shape[1]
+    each = np.ones(m) if weights is None else weights
     order = np.argsort(largest, axis=1, kind="stable")
-    ranks = np.empty_like(order)
-    np.put_along_axis(ranks, order, np.arange(m)[None], axis=1)
-    levels = (np.take_along_axis(ranks, draws.episodes, axis=1) + draws.spread) / m
-    heights = -np.log1p(-np.partition(levels, rank - 1, axis=1)[:, rank - 1])
-    ordered = np.take_along_axis(largest, order, axis=1)
-    expected = np.cumsum(1 / np.arange(m, 0, -1.0))  # of exponential order statistics
+    ordered, ordered_weights = np.take_along_axis(largest, order, axis=1), each[order]
+    total, up_to = round(each.sum()), np.cumsum(ordered_weights, axis=1)
+    below = up_to - ordered_weights
+    # An episode that fills up has no weight, and comes last.
+    starts, drawn_weights = np.full((len(order), m + 1), float(total)), np.append(each, 0.0)
+    np.put_along_axis(starts, order, below, axis=1)
+    drawn_weights = drawn_weights[draws.episodes]
+    levels = np.take_along_axis(starts, draws.episodes, axis=1) + draws.spread * drawn_weights
+    levels /= total
+    by_level = np.argsort(levels, axis=1, kind="stable")
+    weighed = np.cumsum(np.take_along_axis(drawn_weights, by_level, axis=1), axis=1)
+    # The last one drawn, where windows count and few of them were drawn.
+    least = np.minimum((1 - level) * (weighed[:, -1:] + 1), weighed[:, -1:]) - _ROUNDING
+    rank = (weighed < least).sum(axis=1)[:, None]
+    at = np.take_along_axis(by_level, rank, axis=1)
+    heights = -np.log1p(-np.take_along_axis(levels, at, axis=1)[:, 0])
+    # Of exponential order statistics.
+    expected = np.cumsum(ordered_weights / (total - below), axis=1)
     upper = max(math.isqrt(m), 1)
     base = ordered[:, m - 1 - upper] if upper < m else ordered[:, 0]
     excess = (ordered[:, m - upper :] - base[:, None]).mean(axis=1)
     # The line goes through the point below a height and the one above it.
-    above = np.searchsorted(expected, heights).clip(1, max(m - 1, 1))
-    each = np.arange(len(largest))
-    low, high = ordered[each, above - 1], ordered[each, np.minimum(above, m - 1)]
-    gap = expected[above] - expected[above - 1] if m > 1 else 1.0
-    share = ((heights - expected[above - 1]) / gap).clip(0.0, 1.0)
-    beyond = np.maximum(heights - expected[-1], 0.0)
+    above = (expected < heights[:, None]).sum(axis=1).clip(1, max(m - 1, 1))
+    row, last = np.arange(len(largest)), np.minimum(above, m - 1)
+    low, high = ordered[row, above - 1], ordered[row, last]
+    gap = expected[row, last] - expected[row, above - 1] if m > 1 else 1.0
+    share = ((heights - expected[row, above - 1]) / gap).clip(0.0, 1.0)
+    beyond = np.maximum(heights - expected[:, -1], 0.0)
     with np.errstate(invalid="ignore"):
         drawn_values: Floats = low + share * (high - low) + beyond * excess
     # Where statistics are infinite, there is no line between them.
@@ -180,23 +250,36 @@ class Recalibration:
     thresholds: dict[str, Floats]
 
     @classmethod
-    def fit(cls, scores: Sequence[Floats], alarm: AlarmKind, environment: str) -> "Recalibration":
-        """Draw the calibration episodes of an environment, given their scores."""
-        draws = drawn(environment, len(scores))
+    def fit(
+        cls,
+        scores: Sequence[Floats],
+        alarm: AlarmKind,
+        environment: str,
+        recordings: Sequence[Hashable] | None = None,
+    ) -> "Recalibration":
+        """Draw the calibration episodes of an environment, given their scores.
+
+        Windows of several recordings are drawn by recording, those of one as if each were one.
+        """
+        n, numbers = len(scores), numbered(recordings, len(scores))
+        count = len({*numbers.tolist()})
+        draws = drawn(environment, n, tuple(numbers.tolist()) if 1 < count < n else ())
         standards = Standards.fit(scores, draws.episodes)
         statistic = None
-        of_quantile, episodes = draws, scores
+        of_quantile, indices = draws, np.arange(n)
         if alarm == "cusum":
-            statistic = Standards.fit(scores[0::2], draws.half(0).episodes)
-            of_quantile, episodes = draws.half(1), scores[1::2]
-        levels = offered_levels(len(scores), alarm)
+            standardizing, indices = draws.halves
+            statistic = Standards.fit([scores[i] for i in standardizing], draws.half(0).episodes)
+            of_quantile = draws.half(1)
+        levels = offered_levels(n, alarm)
+        episodes, weights = [scores[i] for i in indices], window_weights(numbers[indices])
         largest = _largest(episodes, statistic) if levels else np.zeros((DRAWS, 0))
-        ranks = {s: quantile_rank(len(episodes), level) for s, level in levels.items()}
-        return cls(
-            standards,
-            statistic,
-            {suffix: thresholds(largest, of_quantile, rank) for suffix, rank in ranks.items()},
-        )
+        drawn_thresholds = {}
+        for suffix, level in levels.items():
+            counts_windows = no_promise(n, count, level, alarm)
+            each = None if counts_windows else weights
+            drawn_thresholds[suffix] = thresholds(largest, of_quantile, level, each)
+        return cls(standards, statistic, drawn_thresholds)
 
     def firsts(self, episodes: Sequence[Floats]) -> dict[str, Floats]:
         """Return rows of first guaranteed alarms by suffix, NaN without: (draws, episodes)."""

@@ -61,6 +61,9 @@ class UnpairedScores:
         Task of each nominal and of each anomalous episode.
     clock
         Whether row t of one episode may be compared with row t of another.
+    recordings
+        Number of the recording that each nominal and then each anomalous episode is a window of;
+        empty where each is one. Intervals are over recordings.
     """
 
     nominal: Sequence[Floats]
@@ -69,6 +72,7 @@ class UnpairedScores:
     nominal_tasks: Sequence[str]
     tasks: Sequence[str]
     clock: bool = True
+    recordings: tuple[int, ...] = ()
 
     def by_task(self) -> Iterator[tuple[list[int], list[int]]]:
         """Yield the indices of nominal and of anomalous episodes, for each task with some of both.

@@ -14,7 +14,13 @@ from oodd_eval.data.condition import Condition, conditions_of
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, SPLITS, in_order
 from oodd_eval.data.split import published_digests
 from oodd_eval.metrics.auc import Contribution
-from oodd_eval.metrics.bootstrap import DrawnCells, mean_interval, mean_over_cells, nan_mean
+from oodd_eval.metrics.bootstrap import (
+    DrawnCells,
+    mean_interval,
+    mean_over_cells,
+    nan_mean,
+    sums_of_recordings,
+)
 from oodd_eval.metrics.catalogue import ALARM_RANKING, HEADLINE, LEVELS, NAMES, RANKING, metric_info
 from oodd_eval.metrics.ranking import Position
 from oodd_eval.results.identity import Setting
@@ -323,7 +329,8 @@ def contribution(record: Record, metric: str) -> Contribution:
     """Return a record's terms of a metric, and what its calibration episodes do to it."""
     terms, nominal = record.per_trajectory[metric], _nominal(record)
     deviations = record.calibration_draws.get(metric, _NONE)
-    return Contribution(terms[0], terms[1], _is_median(metric), nominal, deviations)
+    recordings = _recordings(record)
+    return Contribution(terms[0], terms[1], _is_median(metric), nominal, deviations, recordings)
 
 
 _NONE: Final = np.zeros(0)
@@ -334,6 +341,11 @@ def _nominal(record: Record) -> int | None:
     return None if record.paired else record.counts["nominal"]
 
 
+def _recordings(record: Record) -> tuple[int, ...]:
+    """Return the recordings that the episodes of terms are windows of; empty where each is one."""
+    return (*record.recordings.get("nominal", ()), *record.recordings.get("test", ()))
+
+
 def _is_median(metric: str) -> bool:
     return metric in NAMES and metric_info(metric).median
 
@@ -341,17 +353,19 @@ def _is_median(metric: str) -> bool:
 def _drawn_cells(records: Sequence[Record], metric: str) -> dict[tuple[int, ...], DrawnCells]:
     """Return the cells of a row that have terms of a metric, by the indices of their records."""
     # Thresholds are no ratios of sums, and have no terms.
-    by_shape: dict[tuple[str, str, int | None, int], list[int]] = {}
+    by_shape: dict[tuple[str, str, int | None, tuple[int, ...], int], list[int]] = {}
     for i, r in enumerate(records):
         if metric in r.per_trajectory:
             # Each condition without twins has a sample of its own.
             condition = "" if r.paired else str(r.condition)
             size = len(r.per_trajectory[metric][0])
-            by_shape.setdefault((r.environment, condition, _nominal(r), size), []).append(i)
+            key = r.environment, condition, _nominal(r), _recordings(r), size
+            by_shape.setdefault(key, []).append(i)
     cells = {}
-    for (environment, condition, nominal, _), indices in by_shape.items():
+    for (environment, condition, episodes, recordings, _), indices in by_shape.items():
         group = [records[i] for i in indices]
         terms = np.array([r.per_trajectory[metric] for r in group])
+        terms, nominal = sums_of_recordings(terms, episodes, recordings)
         both = terms[:, 0], terms[:, 1]
         deviations = [r.calibration_draws.get(metric, _NONE) for r in group]
         seeds = [r.seed for r in group]

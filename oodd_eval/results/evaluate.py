@@ -5,8 +5,9 @@ Cells without twins have metrics of their own, see `oodd_eval.metrics.unpaired`.
 
 import contextlib
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -55,13 +56,17 @@ class Rules:
         calibration: Sequence[Scores],
         alarm: AlarmKind = "cusum",
         joining: Sequence[Scores] | None = None,
+        recordings: Sequence[Hashable] | None = None,
     ) -> "Rules":
         """Standardize and find thresholds on the scores of nominal trajectories.
 
-        `joining` are those of nominal test episodes that join a rolling calibration.
+        `joining` are those of nominal test episodes that join a rolling calibration, `recordings`
+        what the episodes of both are windows of.
         """
-        levels = alarms.offered_levels(len(calibration), alarm)
-        fitted = Calibration.fit(calibration, alarm)
+        n = len(calibration)
+        levels = alarms.offered_levels(n, alarm)
+        numbers = recordings and alarms.numbered(recordings, n + len(joining or ())).tolist()
+        fitted = Calibration.fit(calibration, alarm, numbers and numbers[:n])
         # A run goes on with a threshold that nothing exceeds, and counts what it misses.
         guaranteed = {
             suffix: replace(fitted.unbounded, threshold=fitted.threshold(level))
@@ -73,7 +78,8 @@ class Rules:
         earlier: dict[str, list[GuaranteedAlarm]] = {}
         for suffix, level in levels.items():
             with contextlib.suppress(UsageError):  # too few for this level
-                earlier[suffix] = alarms.rolling_rules(fitted, joining, level)
+                numbers_of_joining = numbers and numbers[n:]
+                earlier[suffix] = alarms.rolling_rules(fitted, joining, level, numbers_of_joining)
         last = {suffix: rules.pop() for suffix, rules in earlier.items()}
         return cls(paper, last, fitted.unbounded, earlier)
 
@@ -139,6 +145,8 @@ def cell_metrics(
         named = alarms.attribution_contributions(*episodes, levels[HEADLINE])
         terms |= {f"{name}_{HEADLINE}": c for name, c in named.items()}
     terms |= {name: replace(terms[name], deviations=draws[name]) for name in terms if name in draws}
+    if isinstance(cell, UnpairedScores):
+        terms = {name: replace(c, recordings=cell.recordings) for name, c in terms.items()}
     metrics = {name: metric_of(name, c, environment, condition) for name, c in terms.items()}
     return metrics | rules.thresholds(), terms
 
@@ -166,8 +174,7 @@ def evaluated(
     before they differ, see `check_before_effect`.
     """
     try:
-        joining = scores.parts[TWINS] if records[0].rolling else None
-        rules = Rules.fit(scores.parts[CALIBRATION], records[0].alarm, joining)
+        rules = rules_of(records[0], scores.parts, data)
     except OverflowError:
         return _invalid(
             records, "scores are too large: their sum over the calibration trajectories overflows"
@@ -177,6 +184,9 @@ def evaluated(
         return _invalid(
             records, "no score of the calibration trajectories is defined, so there is no threshold"
         )
+    records = [
+        replace(r, recordings=_numbers_of_recordings(r, scores.parts, data)) for r in records
+    ]
     cells = [cell_scores(record, scores.parts, data) for record in records]
     draws = _calibration_draws(records[0], cells, scores, data)
     measured = [
@@ -194,6 +204,41 @@ def evaluated(
         return _invalid(records, reason)
     few = _too_few_to_roll(len(scores.parts[CALIBRATION]), records[0], rules)
     return [replace(r, note=few) if r.rolling else r for r in measured]
+
+
+def rules_of(record: Record, parts: Mapping[str, Sequence[Scores]], data: EnvironmentData) -> Rules:
+    """Return the alarm rules of a unit.
+
+    Parameters
+    ----------
+    record
+        Of any of its cells.
+    parts
+        Its scores by part.
+    data
+        The environment.
+    """
+    calibration, twins = parts[CALIBRATION], parts[TWINS] if record.rolling else None
+    kept = {CALIBRATION: len(calibration), TWINS: len(twins or ())}
+    recordings = [r for part, n in kept.items() for r in (data.recordings(part) or ())[:n]]
+    return Rules.fit(calibration, record.alarm, twins, recordings or None)
+
+
+def _numbers_of_recordings(
+    record: Record, parts: Mapping[str, Sequence[Scores]], data: EnvironmentData
+) -> dict[str, tuple[int, ...]]:
+    """Return what the episodes of a cell are windows of; empty where each is a recording."""
+    names = {"calibration": CALIBRATION, "nominal": TWINS, "test": record.condition.part}
+    labels = {
+        name: (data.recordings(part) or ())[: len(parts[part])]
+        for name, part in names.items()
+        if part in parts and not (name == "test" and part == TWINS)
+    }
+    every = [label for of_part in labels.values() for label in of_part]
+    numbers = iter(alarms.numbered(every, len(every)).tolist())
+    if all(len({*of_part}) == len(of_part) for of_part in labels.values()):
+        return {}
+    return {name: tuple(islice(numbers, len(of_part))) for name, of_part in labels.items()}
 
 
 def _invalid(records: Sequence[Record], reason: str) -> list[Record]:
@@ -317,7 +362,8 @@ def _calibration_draws(
     # A rolling calibration is not resampled: its episodes have an order.
     if first.rolling:
         return [{} for _ in cells]
-    again = Recalibration.fit(scores.parts[CALIBRATION], first.alarm, first.environment)
+    calibration, numbers = scores.parts[CALIBRATION], first.recordings.get("calibration")
+    again = Recalibration.fit(calibration, first.alarm, first.environment, numbers)
     return again.of_cells(cells, data.logs.rate if data.logs else None)
 
 
@@ -412,7 +458,9 @@ def cell_scores(
         anomalous, episodes = parts[record.condition.part], data.anomalous(record.condition)
         rows = (rows[: len(anomalous)].tolist() for rows in (episodes.onsets, episodes.effects))
         return PairedScores(anomalous, nominal, *rows)
-    cell = UnpairedScores(nominal, [], [], data.twins.tasks[: len(nominal)], [], facts.clock)
+    recordings = (*record.recordings.get("nominal", ()), *record.recordings.get("test", ()))
+    tasks = data.twins.tasks[: len(nominal)]
+    cell = UnpairedScores(nominal, [], [], tasks, [], facts.clock, recordings)
     if record.condition == NOMINAL:
         return cell
     anomalous, labelled = parts[record.condition.part], data.labelled(record.condition)

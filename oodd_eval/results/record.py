@@ -267,6 +267,7 @@ class Record:
     metrics: dict[str, Metric] = field(default_factory=dict)
     brief: bool = False
     counts: dict[str, int] = field(default_factory=dict)
+    recordings: dict[str, tuple[int, ...]] = field(default_factory=dict)
     per_trajectory: Mapping[str, Terms] = field(default_factory=dict)
     calibration_draws: Draws = field(default_factory=CodedDraws)
     scores: str = ""
@@ -336,8 +337,8 @@ class Record:
         """Return one line of JSON, keys in a fixed order, NaN as null.
 
         Without a number of its strength the record has no ``magnitude``, as before there was one;
-        ``training``, ``paired``, ``rolling``, ``note`` and ``calibration_draws`` are left out where
-        they say nothing.
+        ``training``, ``paired``, ``rolling``, ``note``, ``recordings`` and ``calibration_draws``
+        are left out where they say nothing.
         """
         silent = {
             "training": "nominal",
@@ -345,6 +346,7 @@ class Record:
             "paired": True,
             "rolling": False,
             "note": "",
+            "recordings": {},
             "calibration_draws": CodedDraws(),
         }
         values = {f.name: getattr(self, f.name) for f in fields(self)}

@@ -11,7 +11,7 @@ from oodd_eval.data.condition import NOMINAL
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, GROUPS, TABLE1, title_of
 from oodd_eval.metrics import catalogue
 from oodd_eval.metrics.alarms import missing_level as _too_few
-from oodd_eval.metrics.alarms import offered_levels
+from oodd_eval.metrics.alarms import no_promise, offered_levels
 from oodd_eval.metrics.bootstrap import nan_mean
 from oodd_eval.metrics.catalogue import PAPER, UNDEFINED, metric_info
 from oodd_eval.names import counted
@@ -23,6 +23,9 @@ from oodd_eval.results.record import Record
 
 BRIEF: Final = "\N{DAGGER}"
 """Marks the figures of brief cells."""
+
+UNPROMISED: Final = "\N{DOUBLE DAGGER}"
+"""Marks columns of alarms whose level too few recordings promise nothing at."""
 
 
 def show_value(value: Value, metric: str) -> str:
@@ -171,10 +174,13 @@ class Tables:
         """Return what a table of guaranteed alarms promises, and which level stands for another."""
         names, asked = [column.metric for column in columns], self.level or catalogue.HEADLINE
         episodes = "nominal twins" if self.board.paired else "nominal test episodes"
-        promise = (
-            f"The threshold promises an alarm in at most {percent_of(self.suffix)} of nominal "
-            f"episodes; false episodes is the share of this split's {episodes} that raised one."
-        )
+        unpromised_cells = [r for r in self.board.records if unpromised(r, self.suffix)]
+        promise = f"False episodes is the share of this split's {episodes} that raised an alarm."
+        if len(unpromised_cells) < len([r for r in self.board.records if r.ok]):
+            promise = (
+                f"The threshold promises an alarm in at most {percent_of(self.suffix)} of nominal "
+                f"episodes; false episodes is the share of this split's {episodes} that raised one."
+            )
         lowered = lowered_level(self.board, asked, self.suffix)
         return _joined(
             promise * bool(names), *(lowered if f"false_episodes_{asked}" not in names else ())
@@ -426,8 +432,11 @@ class Tables:
         """Return columns with a row per detector, by default all in the order of the tables."""
         rows = entries or self.order
         cells = [[*self.labels.get(e, [str(e)]), *texts(self.board, e, columns)] for e in rows]
-        header = [*self.label_names, *(c.title for c in columns)]
-        note = _joined(note, *reasons(self.board, rows, columns))
+        lacking = [_unpromised(self.board, c) for c in columns]
+        marks = (UNPROMISED if sentences else "" for sentences in lacking)
+        header = [*self.label_names, *(c.title + m for c, m in zip(columns, marks, strict=True))]
+        promises = dict.fromkeys(itertools.chain(*lacking))
+        note = _joined(note, *promises, *reasons(self.board, rows, columns))
         return Table(title, header, cells, len(self.label_names), note, wrap=not self.board.paired)
 
 
@@ -510,6 +519,49 @@ def missing_level(board: Board, suffix: str) -> list[str]:
     """Return how many calibration episodes a level takes that rows have no figures at."""
     title = f"guaranteed alarms at {percent_of(suffix)}"
     return reasons(board, board.entries, [Column(f"false_episodes_{suffix}", title)])
+
+
+def unpromised(record: Record, suffix: str) -> str:
+    """Return why a level's figures of a record come with no promise; empty where they do.
+
+    Parameters
+    ----------
+    record
+        Of a cell; one that failed has no figures.
+    suffix
+        The level.
+
+    Returns
+    -------
+    str
+        A phrase without a full stop, see `oodd_eval.metrics.alarms.no_promise`.
+    """
+    numbers = record.recordings.get("calibration", ())
+    if not record.ok or not numbers or f"false_episodes_{suffix}" not in record.metrics:
+        return ""
+    level = catalogue.LEVELS[suffix]
+    counts = len(numbers), len({*numbers})
+    return no_promise(*counts, level, record.alarm, rolling=record.rolling)
+
+
+def promises_lacking(record: Record) -> list[str]:
+    """Return `unpromised` for each level of a record, the largest first."""
+    return [*filter(None, (unpromised(record, suffix) for suffix in catalogue.LEVELS))]
+
+
+def _unpromised(board: Board, column: Column) -> list[str]:
+    """Return which promises a column of alarms lacks, a sentence for each reason."""
+    suffix = f"at_{column.metric.rpartition('_at_')[2]}"
+    if suffix not in catalogue.LEVELS:
+        return []
+    places: dict[str, dict[str, None]] = {}
+    for r in board.records:
+        is_shown = not column.environments or r.environment in column.environments
+        if is_shown and (text := unpromised(r, suffix)):
+            places.setdefault(text, {})[r.environment] = None
+    several = len(board.environments) > 1
+    prefixes = [f"{_listed(names, 'environments')}: " * several for names in places.values()]
+    return [f"{UNPROMISED} {a}{text}." for a, text in zip(prefixes, places, strict=True)]
 
 
 def lowered_level(board: Board, asked: str, level: str) -> list[str]:
@@ -664,7 +716,17 @@ def _episodes(board: Board) -> list[str]:
         counts = {name: n for r in cells for name, n in r.counts.items()}
         tests = {str(r.condition): r.counts.get("test", 0) for r in cells if r.condition != NOMINAL}
         listed = [f"{n} {name}" for name, n in tests.items()]
-        named = [f"{counts[k]} {text}" for k, text in _PARTS.items() if k in counts]
+        several = {name: len({*n}) for r in cells for name, n in r.recordings.items()}
+        of_recordings = {
+            name: f" ({counted(n, 'recording(s)')})"
+            for name, n in several.items()
+            if n < counts.get(name, 0)
+        }
+        named = [
+            f"{counts[name]} {text}{of_recordings.get(name, '')}"
+            for name, text in _PARTS.items()
+            if name in counts
+        ]
         lines.append(f"Episodes of {environment}: {', '.join([*named, *listed])}.")
     return lines
 
@@ -717,4 +779,5 @@ def _left_out(record: Record, metric: str) -> str:
     episodes = record.counts.get("calibration")
     if episodes is None or suffix in offered_levels(episodes, record.alarm):
         return ""
-    return _too_few(episodes, catalogue.LEVELS[suffix], record.alarm)
+    recordings = len({*record.recordings.get("calibration", range(episodes))})
+    return _too_few(episodes, catalogue.LEVELS[suffix], record.alarm, recordings)

@@ -56,6 +56,8 @@ def doubts_after(
             if scores is None:
                 continue
             label = unit.setting.label(unit.seed)
-            finding = achieved_share(scores.parts[CALIBRATION], unit.alarm, label)
+            calibration, recordings = scores.parts[CALIBRATION], data.recordings(CALIBRATION)
+            recordings = recordings and recordings[: len(calibration)]
+            finding = achieved_share(calibration, unit.alarm, label, recordings)
             if finding is not None and finding.doubt:
                 yield unit.environment, finding

@@ -34,12 +34,13 @@ def promises_of(
         return [enough_episodes(len(data.calibration.lengths[:limit]), kinds)]
     rows = data.baseline
     base = Baseline.fit(islice(data.train, limit), rows) if rows else None
-    parts = (islice(part, limit) for part in (data.train, data.calibration, data.twins))
-    train, calibration, nominal = (EpisodeMeans(*episode_means(part, base)) for part in parts)
+    parts = []
+    for part in (data.train, data.calibration, data.twins):
+        recordings = data.recordings(part.group)
+        means = episode_means(islice(part, limit), base)
+        parts.append(EpisodeMeans(*means, recordings and recordings[:limit]))
     return promises(
-        train,
-        calibration,
-        nominal,
+        *parts,
         sensors=[quantity.name for quantity in data.sensors],
         recorded=in_recorded_order(data),
         kinds=kinds,
