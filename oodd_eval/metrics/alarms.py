@@ -724,7 +724,8 @@ def attribution_contributions(
     anomalous
         Scores of the n anomalous trajectories.
     explained
-        For each, of shape (2, rows): the sensor that is named first at a row, and the onset.
+        For each, of shape (2, rows): the sensor that is named first at a row, and the onset; -1
+        where nothing was explained.
     corrupted
         For each, the sensors that the anomaly corrupts: none where it is not of the sensors, which
         leaves ``sensor_named`` undefined.
@@ -741,8 +742,8 @@ def attribution_contributions(
     named, errors = np.full((2, len(anomalous)), np.nan)
     for i, (scores, effect) in enumerate(zip(anomalous, effects, strict=True)):
         first = rule.first(scores)
-        if first is not None and first >= effect:
-            sensor, onset = explained[i][:, first].tolist()
+        sensor, onset = (-1, -1) if first is None else explained[i][:, first].tolist()
+        if first is not None and first >= effect and onset >= 0:
             errors[i] = abs(onset - effect)
             if corrupted[i]:
                 named[i] = sensor in corrupted[i]

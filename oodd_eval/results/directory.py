@@ -65,7 +65,7 @@ class ScoreFile:
     `cost` holds ``seconds_fit``, ``seconds_score`` and ``peak_rss_mb`` of the fit, and
     ``steps_scored``, the number of observations that ``seconds_score`` is for. `explained` are
     explanations by part, int32 arrays of shape (2, rows) with the sensors named first and the
-    onsets, of anomalous parts and detectors that explain only.
+    onsets, of anomalous parts and detectors that explain only: -1 but at first guaranteed alarms.
     """
 
     parts: dict[str, list[NDArray[np.float64]]]

@@ -92,6 +92,26 @@ class Rules:
         return {name: Metric(t if math.isfinite(t) else NAN) for name, t in values.items()}
 
 
+def first_alarms(
+    parts: Mapping[str, Sequence[Scores]], alarm: AlarmKind
+) -> dict[str, list[int | None]]:
+    """Return where explanations are compared with the truth: rows by anomalous part.
+
+    These are of the first guaranteed alarms at the headline's level; None without one, and where
+    calibration episodes are too few.
+
+    Parameters
+    ----------
+    parts
+        Scores of a unit whose episodes have twins, by part.
+    alarm
+        Statistic of the guaranteed alarms.
+    """
+    rule = Rules.fit(parts[CALIBRATION], alarm).guaranteed.get(HEADLINE)
+    tests = {part: of_part for part, of_part in parts.items() if part not in (CALIBRATION, TWINS)}
+    return {part: [rule.first(x) if rule else None for x in xs] for part, xs in tests.items()}
+
+
 def cell_metrics(
     cell: PairedScores | UnpairedScores,
     rules: Rules,

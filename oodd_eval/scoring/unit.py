@@ -30,6 +30,7 @@ from oodd_eval.plugins.isolation.child import Launcher, Limits, Stop
 from oodd_eval.plugins.isolation.supervisor import Outcome, run_isolated
 from oodd_eval.plugins.state import PackedState
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
+from oodd_eval.results.evaluate import first_alarms
 from oodd_eval.results.record import Status
 from oodd_eval.scoring.plan import Plan, Unit
 
@@ -146,7 +147,8 @@ class GroupedScoring:
     test seeds, the twins, or one anomaly (without twins: a part of any of these). It is scored
     apart from all others, in the order of the split, so that scores are the same bit for bit. A
     detector that explains is asked to in the same way, when all is scored: only the anomalous
-    trajectories. Where rows are streamed, groups hold all parts, see `mixed`.
+    trajectories with twins, up to the first guaranteed alarm, which metrics are of. Where rows are
+    streamed, groups hold all parts, see `mixed`, and nothing is explained.
     """
 
     def __init__(self, job: UnitJob, progress: Progress = ignore_progress) -> None:
@@ -166,7 +168,9 @@ class GroupedScoring:
         self._train = _Visible(job.data.train, job.plan.limit, self._visible)
         sizes = {part: len(lengths) for part, lengths in self._lengths.items()}
         self._groups = mixed(sizes) if job.streamed else groups(sizes)
-        self._explained = [group for group in self._groups if group[0].part not in _NOMINAL]
+        # Metrics with twins alone are of explanations, and there are no baseline rows then.
+        self._explains = job.data.paired and not rows and not job.streamed
+        self._explained: dict[Member, int] = {}  # rows of each episode that is explained
 
     def isolated(
         self, limits: Limits, stop: Stop, *, state: PackedState | None = None, keep: bool = False
@@ -182,12 +186,11 @@ class GroupedScoring:
             "baseline": self._adapting,
             "roles": unit.roles,
         }
-        parts, again = (map(self._members, g) for g in (self._groups, self._explained))
         return run_isolated(
             request,
             self._train,
-            parts,
-            again,
+            map(self._members, self._groups),
+            lambda outcome: self._alarmed(outcome.scores, outcome.warm_up),
             limits=limits,
             stop=stop,
             launcher=self._job.launcher,
@@ -204,7 +207,8 @@ class GroupedScoring:
         steps = sum(map(sum, self._lengths.values()))
         cost = {name: value for name in COSTS if (value := getattr(outcome, name)) is not None}
         try:
-            scores = self._file(outcome.scores, outcome.explained, outcome.warm_up)
+            explained = outcome.explained if outcome.explains else None
+            scores = self._file(outcome.scores, explained, outcome.warm_up)
         except ContractError as error:
             return Scored("invalid", str(error), log=outcome.log)
         return Scored(file=replace(scores, cost={**cost, "steps_scored": steps}))
@@ -217,15 +221,16 @@ class GroupedScoring:
         detector = self._fitted()
 
         def returned(
-            groups: Iterable[list[Member]], work: Callable[..., list[object]]
+            groups: Iterable[Iterable[Trajectory]], work: Callable[..., list[object]]
         ) -> list[object]:
-            chunks = ([*self._members(group)] for group in groups)
+            chunks = map(list, groups)
             return [result for chunk in chunks for result in work(self._another(detector), chunk)]
 
-        scores = returned(self._groups, contract.score_chunk)
-        again = self._explained if explanations.explains(detector) else ()
-        explained = returned(again, explanations.explain_chunk)
-        return Scored(file=self._file(scores, explained, getattr(detector, "warm_up", 0)))
+        scores = returned(map(self._members, self._groups), contract.score_chunk)
+        explained, warm_up = None, getattr(detector, "warm_up", 0)
+        if explanations.explains(detector):
+            explained = returned(self._alarmed(scores, warm_up), explanations.explain_chunk)
+        return Scored(file=self._file(scores, explained, warm_up))
 
     def _fitted(self) -> contract.Detector:
         """Return a detector that was made and fitted in this process."""
@@ -260,22 +265,37 @@ class GroupedScoring:
         """The number of baseline rows for a detector that adapts to them, else 0."""
         return self._rows if self._adapts else 0
 
-    def _whole(self, scores: ScoreFile) -> ScoreFile:
-        """Return scores and explanations of whole episodes, undefined in their baseline rows."""
+    def _whole(self, parts: dict[str, list[contract.Scores]]) -> dict[str, list[contract.Scores]]:
+        """Return scores of whole episodes, undefined in their baseline rows."""
         rows = self._rows
         if not rows:
-            return scores
+            return parts
         # Of a detector that adapts these rows were scored, too.
         start = rows if self._adapts else 0
-        parts = {
+        return {
             part: [np.concatenate([np.full(rows, np.nan), array[start:]]) for array in arrays]
-            for part, arrays in scores.parts.items()
+            for part, arrays in parts.items()
         }
-        explained = {
-            part: [_behind(array[:, start:], rows, rows - start) for array in arrays]
-            for part, arrays in scores.explained.items()
+
+    def _alarmed(self, scores: Sequence[object], warm_up: object) -> Iterator[Iterator[Trajectory]]:
+        """Yield what is to be explained by group: episodes up to their first guaranteed alarm."""
+        if not self._explains:
+            return
+        try:
+            firsts = first_alarms(self._checked(scores, warm_up), self._job.unit.alarm)
+        except (ContractError, OverflowError):
+            return  # The records say so.
+        self._explained = {
+            Member(part, i): first + 1
+            for part, rows in firsts.items()
+            for i, first in enumerate(rows)
+            if first is not None
         }
-        return replace(scores, parts=parts, explained=explained)
+        for group in self._groups:
+            if alarmed := [member for member in group if member in self._explained]:
+                rows_of = [self._explained[member] for member in alarmed]
+                pairs = zip(self._members(alarmed), rows_of, strict=True)
+                yield (trajectory[:rows] for trajectory, rows in pairs)
 
     def _members(self, group: Iterable[Member]) -> Iterator[Trajectory]:
         return (self._visible(self._sets[part][i]) for part, i in group)
@@ -287,12 +307,34 @@ class GroupedScoring:
         return judged.without_actions() if withheld else judged
 
     def _file(
-        self, scores: Sequence[object], explained: Sequence[object], warm_up: object
+        self, scores: Sequence[object], explained: Sequence[object] | None, warm_up: object
     ) -> ScoreFile:
         """Check what came back; raise `ContractError`, or return it by part, in whole episodes."""
+        parts = self._checked(scores, warm_up)
+        if explained is None or not self._explains:
+            return ScoreFile(self._whole(parts), {})
+        named: dict[str, list[Named]] = {
+            part: [np.full((2, len(rows)), -1, np.int32) for rows in sequences]
+            for part, sequences in parts.items()
+            if part not in _NOMINAL
+        }
+        # They come in the order of the groups.
+        again = [member for member in chain(*self._groups) if member in self._explained]
+        for member, array in zip(again, explained, strict=True):
+            (part, i), rows = member, self._explained[member]
+            label = f"{self._job.unit.environment}/{part}[{i}]"
+            sensors = len(self._job.data.sensors)
+            checked = explanations.check_named(array, parts[part][i][:rows], sensors, label)
+            named[part][i][:, rows - 1] = checked[:, -1]
+        return ScoreFile(parts, {}, named)
+
+    def _checked(
+        self, scores: Sequence[object], warm_up: object
+    ) -> dict[str, list[contract.Scores]]:
+        """Return what the detector returned by part; `ContractError` for what are no scores."""
         unit = self._job.unit
         by_member = dict(zip(chain(*self._groups), scores, strict=True))
-        parts = {
+        return {
             part: [
                 contract.check_scores(
                     by_member[Member(part, i)],
@@ -307,13 +349,6 @@ class GroupedScoring:
             ]
             for part, lengths in self._lengths.items()
         }
-        again = self._explained if explained else ()
-        named: dict[str, list[Named]] = {group[0].part: [] for group in again}
-        for (part, i), array in zip(chain(*again), explained, strict=True):
-            label = f"{unit.environment}/{part}[{i}]"
-            sensors = len(self._job.data.sensors)
-            named[part].append(explanations.check_named(array, parts[part][i], sensors, label))
-        return self._whole(ScoreFile(parts, {}, named))
 
 
 def _callers_level() -> int:
@@ -340,13 +375,6 @@ class _Visible(TrajectorySequence):
 
     def _one(self, i: int) -> Trajectory:
         return self._view(self._members[i])
-
-
-def _behind(explained: Named, rows: int, shift: int) -> Named:
-    """Return an explanation behind undefined rows; what it calls onsets are `shift` rows later."""
-    onsets = np.where(explained[1] < 0, -1, explained[1] + shift)
-    shifted = np.stack([explained[0], onsets])
-    return np.concatenate([np.full((2, rows), -1), shifted], axis=1).astype(np.int32)
 
 
 def groups(sizes: Mapping[str, int]) -> list[list[Member]]:

@@ -7,7 +7,7 @@ from helpers_plugins import install
 
 from oodd_eval import Explanation, Trajectory, evaluate, load_split
 from oodd_eval.cli.main import main
-from oodd_eval.data.parts import CALIBRATION, TWINS, lengths_of, parts_of
+from oodd_eval.data.parts import CALIBRATION, TWINS
 from oodd_eval.errors import ContractError
 from oodd_eval.metrics.alarms import GuaranteedAlarm, attribution_contributions
 from oodd_eval.metrics.auc import mean_of
@@ -15,7 +15,7 @@ from oodd_eval.metrics.bootstrap import bootstrap_weights, resampled
 from oodd_eval.metrics.catalogue import ATTRIBUTION
 from oodd_eval.plugins.explanations import check_named, explain_chunk, explains
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
-from oodd_eval.results.evaluate import rescore
+from oodd_eval.results.evaluate import rescore, stored_scores
 
 NAN = float("nan")
 SENSOR_NAMED, ONSET_ERROR = ATTRIBUTION
@@ -248,18 +248,27 @@ def test_records_have_the_metrics_of_detectors_that_explain_only(world):
     assert iid.metrics[SENSOR_NAMED].value > 0.5
 
 
-def test_only_the_anomalous_are_explained_each_group_in_a_process_of_its_own(world):
-    home, _ = world
+def test_anomalous_episodes_are_explained_up_to_their_alarms_each_group_in_a_process(world):
+    home, found = world
     calls = [tuple(map(int, line.split())) for line in (home / "log").read_text().splitlines()]
     with load_split("mini").opened() as opened:
-        data = opened("cartpole")
-        lengths = lengths_of(parts_of(data, ["iid", "drift", "gravity"]), None)
-    anomalous = [own for part, own in lengths.items() if part not in (CALIBRATION, TWINS)]
-    whole = sorted(n for _, n in calls)
-    for n in (n for own in anomalous for n in own):
-        whole.remove(n)
-    assert not whole
-    assert len({pid for pid, _ in calls}) == len(anomalous)
+        file = stored_scores(found["tells"], ResultsDirectory(home / "results"), opened("cartpole"))
+    rule = GuaranteedAlarm.fit(file.parts[CALIBRATION], 0.05, found["tells"][0].alarm)
+    firsts = {
+        part: [rule.first(scores) for scores in sequences]
+        for part, sequences in file.parts.items()
+        if part not in (CALIBRATION, TWINS)
+    }
+    alarms = [first for rows in firsts.values() for first in rows if first is not None]
+    assert sorted(n for _, n in calls) == sorted(first + 1 for first in alarms)
+    assert len({pid for pid, _ in calls}) == sum(
+        rows != [None] * len(rows) for rows in firsts.values()
+    )
+    assert {*file.explained} == {*firsts}
+    for part, rows in firsts.items():
+        for first, scores, named in zip(rows, file.parts[part], file.explained[part], strict=True):
+            assert named.shape == (2, len(scores))
+            assert np.flatnonzero(named[1] >= 0).tolist() == ([] if first is None else [first])
 
 
 def test_scores_of_a_file_without_explanations_are_scored_as_ever(world, tmp_path):
@@ -299,8 +308,8 @@ FAILURES = {
 
 
 @pytest.mark.usefixtures("world")
-def test_a_failing_explanation_is_a_state_with_a_reason(tiny_split):
-    records = evaluate([*FAILURES], tiny_split, environments="hopper", anomalies="iid")
+def test_a_failing_explanation_is_a_state_with_a_reason():
+    records = evaluate([*FAILURES], environments="cartpole", anomalies="iid")
     assert [record.detector for record in records] == [*FAILURES]
     for record in records:
         status, reason = FAILURES[record.detector]

@@ -7,7 +7,7 @@ import pytest
 from helpers_logs import UNPAIRED, log_episode, make_log_split, write_log_split
 from helpers_plugins import install
 
-from oodd_eval import DetectorSpec, Explanation, Trajectory, load_split
+from oodd_eval import DetectorSpec, Trajectory, load_split
 from oodd_eval.data.baseline import Baseline
 from oodd_eval.data.parts import CALIBRATION, TWINS
 from oodd_eval.errors import TrajectoryError
@@ -113,33 +113,6 @@ def test_a_detector_that_adapts_is_handed_whole_episodes_and_their_number(tmp_pa
             assert np.isnan(scores[:B]).all()
             size = np.abs(x.observations).sum(axis=1).astype(np.float64)
             assert np.array_equal(scores[B:], size[B:] + 1000 * B)
-
-
-class Explains(Remembers):
-    """Names the second sensor, and the row before as the onset."""
-
-    def score(self, x):
-        scores = super().score(x)
-        scores[0] = np.nan
-        return scores
-
-    def explain(self, x):
-        shares, onsets = np.tile([0.0, 1.0, 0.0], (len(x), 1)), np.arange(len(x)) - 1
-        shares[0] = np.nan
-        return Explanation(shares, onsets)
-
-
-@pytest.mark.parametrize("adapts", ["", "baseline"])
-def test_explanations_count_the_rows_of_whole_episodes(tmp_path, adapts):
-    split = load_split(make_log_split(tmp_path / "arm", FACTS, calibration=20))
-    file = scored(split, Explains, adapts=adapts)
-    first = B if adapts else B + 1  # the first row that is scored behind the baseline's
-    for scores, (sensors, onsets) in zip(
-        file.parts["test/slip"], file.explained["test/slip"], strict=True
-    ):
-        later = range(first, len(scores))
-        assert sensors.tolist() == [*[-1] * first, *[1 for _ in later]]
-        assert onsets.tolist() == [*[-1] * first, *[t - 1 for t in later]]
 
 
 @pytest.mark.slow

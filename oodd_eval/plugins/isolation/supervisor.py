@@ -3,11 +3,11 @@
 import math
 import signal
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 import psutil
@@ -40,7 +40,7 @@ class Outcome:
     """Scores of a fit, or the way in which it failed.
 
     `status` is as in a record, with a reason of one line unless ok. `scores`, `warm_up` and what is
-    kept of explanations, if it has `explained`, are the detector's own, and checked only for their
+    kept of explanations, if it `explains`, are the detector's own, and checked only for their
     number and size. `state` is that of the fit, checked, where it was asked for and there is one.
     Costs are None when the worker ended before they were known; what it told of them is held within
     what this process knows. `log` is the end of the detector's output.
@@ -49,6 +49,7 @@ class Outcome:
     status: str = "ok"
     reason: str = ""
     scores: list[object] = field(default_factory=list)
+    explains: bool = False
     explained: list[object] = field(default_factory=list)
     warm_up: object = 0
     state: PackedState | None = None
@@ -58,11 +59,15 @@ class Outcome:
     log: str = ""
 
 
+Explained: TypeAlias = Callable[[Outcome], Iterable[Iterable[Trajectory]]]
+"""A function that returns, when all is scored, groups of trajectories to be explained."""
+
+
 def run_isolated(
     request: Mapping[str, Any],
     train: Sequence[Trajectory],
     groups: Iterable[Iterable[Trajectory]],
-    explained: Iterable[Iterable[Trajectory]] = (),
+    explained: Explained | None = None,
     *,
     limits: Limits,
     stop: Stop,
@@ -77,13 +82,12 @@ def run_isolated(
     A group's process is a fork of the fitted one. Where there can be none, as threads run on after
     the fit or a launcher starts each process, it is a fresh one, which takes over the state of the
     fit; with a launcher, a detector without a state is fitted again in each. A detector that
-    explains is asked to explain the groups `explained` in the same way, last.
+    explains is asked to explain the groups that `explained` returns in the same way, last.
 
     The request names ``plugin`` and ``detector``, its ``parameters``, ``seed``, ``horizon`` and
     perhaps ``baseline`` and ``roles`` (see `make_detector`). `state` is that of an earlier fit,
     which replaces fitting; with `keep`, the outcome has that of this one. `streamed` hands over one
-    row of each episode at a time, and waits for the scores before the next; then nothing is
-    explained.
+    row of each episode at a time, and waits for the scores before the next.
     `progress` is called with the share of the fit that is done, as far as the detector tells, and
     with 1 at its end.
 
@@ -116,13 +120,10 @@ class _UnitRun:
     start: float = field(default_factory=time.monotonic)
     seconds: float = 0.0
     peak: float = 0.0
-    explains: bool = False
     updates: bool = False
     streams: int = CHUNK
 
-    def run(
-        self, groups: Iterable[Iterable[Trajectory]], explained: Iterable[Iterable[Trajectory]]
-    ) -> None:
+    def run(self, groups: Iterable[Iterable[Trajectory]], explained: Explained | None) -> None:
         """Fit and score; `GivenUpError` for any failure."""
         with ExitStack() as stack:
             fitted = None
@@ -135,8 +136,9 @@ class _UnitRun:
                 self._group(fitted, group, "stream" if self.streamed else "score")
             # Explain last: only anomalous episodes are explained, and a scoring process must not
             # learn which.
-            for group in explained if self.explains and not self.streamed else ():
-                self._group(fitted, group, "explain")
+            if explained and self.outcome.explains:
+                for group in explained(self.outcome):
+                    self._group(fitted, group, "explain")
         self.outcome.seconds_score = min(self.seconds, time.monotonic() - self.start)
         self.outcome.peak_rss_mb = self.peak
 
@@ -197,7 +199,7 @@ class _UnitRun:
         self.progress(1.0)
         outcome.seconds_fit = seconds if outcome.seconds_fit is None else outcome.seconds_fit
         outcome.warm_up = _value(message, "warm_up", object)
-        self.explains, self.updates, can_fork, follows = (
+        outcome.explains, self.updates, can_fork, follows = (
             _value(message, name, bool) for name in ("explains", "updates", "forks", "state")
         )
         if follows:
