@@ -68,7 +68,7 @@ def log_arrays(episodes, *, labelled, sensors=3, actions=1):
     return arrays
 
 
-def write_log_environment(directory, parts, facts=UNPAIRED, *, environment="arm"):
+def write_log_environment(directory, parts, facts=UNPAIRED, *, environment="arm", recordings=None):
     """Write an environment's episodes by part (``"train"``, ``"test/slip"``); return its entry.
 
     A part that is not named is empty; `facts` must not say that episodes are paired.
@@ -87,12 +87,13 @@ def write_log_environment(directory, parts, facts=UNPAIRED, *, environment="arm"
         actions=[Quantity("cmd", "V")],
         custom=own_facts(environment, discrete=False, groups=dict.fromkeys(kinds, "dynamics")),
         logs=facts,
+        recordings=recordings,
     )  # fmt: skip
 
 
-def write_log_split(directory, parts, facts=UNPAIRED, *, name="arm", environment="arm"):
+def write_log_split(directory, parts, facts=UNPAIRED, *, name="arm", environment="arm", **more):
     """Write a split of one environment, see `write_log_environment`; return the directory."""
-    entry = write_log_environment(directory, parts, facts, environment=environment)
+    entry = write_log_environment(directory, parts, facts, environment=environment, **more)
     return write_log_manifest(directory, {environment: entry}, name=name)
 
 

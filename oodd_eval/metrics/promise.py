@@ -257,7 +257,9 @@ def promises(
     """
     findings = [enough_episodes(len(calibration.lengths), kinds, calibration.count)]
     parts, noun = [train, calibration, nominal], "episodes"
-    if FEWEST <= sum(part.count for part in parts) < sum(len(part.lengths) for part in parts):
+    # Where recordings are too few for any level, figures count windows, and windows are compared.
+    has_levels = any(offered_levels(calibration.count, kind) for kind in kinds)
+    if has_levels and any(part.count < len(part.lengths) for part in parts):
         parts, noun = [part.by_recording() for part in parts], "recordings"
         train, calibration, nominal = parts
     if recorded:

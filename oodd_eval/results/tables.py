@@ -554,14 +554,21 @@ def _unpromised(board: Board, column: Column) -> list[str]:
     suffix = f"at_{column.metric.rpartition('_at_')[2]}"
     if suffix not in catalogue.LEVELS:
         return []
-    places: dict[str, dict[str, None]] = {}
+    concerned: dict[str, tuple[dict[str, None], dict[str, None]]] = {}  # places and rows by reason
     for r in board.records:
         is_shown = not column.environments or r.environment in column.environments
         if is_shown and (text := unpromised(r, suffix)):
-            places.setdefault(text, {})[r.environment] = None
-    several = len(board.environments) > 1
-    prefixes = [f"{_listed(names, 'environments')}: " * several for names in places.values()]
-    return [f"{UNPROMISED} {a}{text}." for a, text in zip(prefixes, places, strict=True)]
+            of_text = concerned.setdefault(text, ({}, {}))
+            of_text[0][r.environment] = of_text[1][str(r.setting)] = None
+    prefix = ""
+    sentences = []
+    for text, (places, rows) in concerned.items():
+        if len(concerned) > 1:
+            several = len(board.environments) > 1
+            names = [_listed(places, "environments")] * several + [_listed(rows, "rows")]
+            prefix = f"{', '.join(names)}: "
+        sentences.append(f"{UNPROMISED} {prefix}{text}.")
+    return sentences
 
 
 def lowered_level(board: Board, asked: str, level: str) -> list[str]:

@@ -2,10 +2,18 @@
 
 import dataclasses
 import math
+import warnings
 
 import numpy as np
 import pytest
-from helpers_logs import UNPAIRED, log_episode, make_log_split, nominal_episodes
+from helpers_logs import (
+    UNPAIRED,
+    log_episode,
+    log_parts,
+    make_log_split,
+    nominal_episodes,
+    write_log_split,
+)
 from oodd_live import Watchdog
 
 from oodd_eval import Trajectory, load_split
@@ -49,6 +57,38 @@ def test_confirmed_episodes_join_the_calibration(tmp_path):
         one.confirm()
         assert reading.threshold != one.rule.threshold or one.rule == watchdog.rule
     assert other.calibration == watchdog.calibration
+
+
+def test_windows_of_one_recording_promise_nothing_and_those_of_many_their_share(tmp_path):
+    train, calibration = nominal_episodes(range(40)), nominal_episodes(range(100, 140))
+    plain = Watchdog.fit("mahalanobis", train, calibration, 0.10)
+    words = "40 windows of 1 recording: no promise at 10 %; 18 recordings would"
+    with pytest.warns(PromiseWarning, match=words):
+        watchdog = Watchdog.fit("mahalanobis", train, calibration, 0.10, recordings=["a"] * 40)
+    assert watchdog.rule == plain.rule
+    assert (watchdog.promise, watchdog.notes[0]) == (words, words)
+    watchdog.save(tmp_path / "kept")
+    other = Watchdog.load(tmp_path / "kept")
+    assert (other.promise, other.calibration) == (words, watchdog.calibration)
+    several = [i // 2 for i in range(40)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", PromiseWarning)
+        of_files = Watchdog.fit("mahalanobis", train, calibration, 0.10, recordings=several)
+    scores = [of_files._handle.detector.score(x) for x in calibration]
+    expected = GuaranteedAlarm.fit(scores, 0.10, "cusum", None, several)
+    assert of_files.rule.threshold == pytest.approx(expected.threshold)
+    assert of_files.promise.startswith("at most 10 %")
+    with pytest.raises(UsageError, match="3 recordings of 40 episodes"):
+        Watchdog.fit("mahalanobis", train, calibration, 0.10, recordings=["a", "b", "c"])
+
+
+def test_an_environment_knows_the_recordings_of_its_windows(tmp_path):
+    numbers = {"train": range(40), "calibration": [40] * 40, "test/nominal": range(41, 49)}
+    parts = log_parts(train=40, anomalies={})
+    split = load_split(write_log_split(tmp_path, parts, recordings=numbers))
+    with split.opened() as opened, pytest.warns(PromiseWarning, match="of 1 recording"):
+        watchdog = Watchdog.fit("mahalanobis", opened("arm"), alpha=0.10)
+    assert watchdog.calibration.recording_count == 1
 
 
 def test_an_acknowledged_alarm_and_a_fault_count_when_an_episode_is_confirmed():

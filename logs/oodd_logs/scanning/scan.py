@@ -395,9 +395,9 @@ def _scan_with(
     )
     terms = _Terms("a watchdog", fdr, notes, watchdog.rule.threshold)
     if (calibration := watchdog.calibration) is not None:
-        weights = window_weights(np.array(calibration.numbers, np.intp))
-        reference = _Reference(np.array(calibration.largest), weights)
-        enough = (reference.count + 1) * fdr >= len(episodes)
+        reference = _Reference.of(np.array(calibration.largest), np.array(calibration.numbers))
+        windows = reference.count > len({*calibration.numbers})
+        enough = (reference.count + 1) * fdr >= len(episodes) and not windows
         terms = replace(terms, reference=reference, exact=enough and not calibration.rolling)
     return _verdict(judged, watchdog.sensors, terms)
 
@@ -531,8 +531,15 @@ class _Reference(NamedTuple):
     largest: Floats
     weights: Floats
 
+    @classmethod
+    def of(cls, largest: Floats, numbers: NDArray[np.intp]) -> "_Reference":
+        """Let windows of a recording count once, unless recordings are too few to judge by."""
+        is_enough = len({*numbers.tolist()}) + 1 >= LEAST
+        return cls(largest, window_weights(numbers) if is_enough else np.ones(len(largest)))
+
     @property
     def count(self) -> int:
+        """Number of recordings, or of windows that count as such."""
         return round(self.weights.sum())
 
 
@@ -624,8 +631,8 @@ def _reference(largest: Floats, episodes: Sequence[Episode], i: int) -> _Referen
     others = [j for j in peers if episodes[j].recording != episodes[i].recording]
     numbers = numbered([episodes[j].recording for j in others], len(others))
     if len({*numbers.tolist()}) + 1 < LEAST:
-        return _Reference(largest[peers], np.ones(len(peers)))
-    return _Reference(largest[others], window_weights(numbers))
+        others, numbers = peers, np.arange(len(peers))
+    return _Reference.of(largest[others], numbers)
 
 
 def _statistic(kind: AlarmKind, scores: Sequence[Floats], peers: Sequence[int], i: int) -> Floats:
