@@ -94,7 +94,8 @@ def product(rows: Floats, matrix: Floats, block: int = BLOCK) -> Floats:
     if n <= block:
         few = np.zeros((block, k))
         few[:n] = rows
-        return np.asarray(np.matmul(few, matrix)[:n], np.float64)
+        few_multiplied: Floats = np.matmul(few, matrix)[:n]
+        return few_multiplied
     count = -(-n // block)
     filled = np.zeros((count * block, k))
     filled[:n] = rows

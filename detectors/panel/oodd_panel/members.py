@@ -44,6 +44,8 @@ SHRINKAGE: Final = 0.02
 """Least share of the identity in a correlation matrix."""
 PATTERNS: Final = 1000
 """Most windows from which the components of many sensors are computed."""
+CHUNK: Final = 4096
+"""Rows whose features are looked at together: bounds memory."""
 
 
 class Features(NamedTuple):
@@ -85,9 +87,8 @@ class Latest:
 
     def __init__(self, dimensions: int, window: int) -> None:
         self._window = window
-        self._lags = np.arange(window)[::-1]
         self._smoother = Smoother(WEIGHTS, dimensions)
-        self._rows: Floats | None = None
+        self._rows: Floats | None = None  # newest first
         self._levels: Floats
         # What an error before the beginning would have been on average.
         self._squares = np.ones((ENERGY - 1, dimensions))
@@ -102,24 +103,25 @@ class Latest:
         if self._rows is None:
             self._rows = np.repeat(rows[:1], self._window - 1, axis=0)
             self._levels = np.repeat(levels[:1], LEVEL - 1, axis=0)
-        every = np.concatenate([self._rows, rows])
-        window = every[np.arange(n)[:, None] + self._lags].reshape(n, -1)
+        every = np.concatenate([rows[::-1], self._rows])
+        # Windows overlap in memory: copies would take twenty times as much of it.
+        row = every.itemsize * every.shape[1]
+        shape, strides = (n, self._window * every.shape[1]), (-row, every.itemsize)
+        window: Floats = np.ndarray(shape, every.dtype, every, max(n - 1, 0) * row, strides)
         all_levels = np.concatenate([self._levels, levels])
         squares = np.concatenate([self._squares, np.minimum(errors**2, LARGEST)])
-        # Sums of few terms in a fixed order: the same bits for one row as for many.
-        level = _sum([all_levels[lag : lag + n] for lag in range(LEVEL)]) / LEVEL
-        energy = _sum([squares[lag : lag + n] for lag in range(ENERGY)])
-        self._rows, self._levels = every[n:], all_levels[n:]
+        level, energy = _sums(all_levels, LEVEL) / LEVEL, _sums(squares, ENERGY) / ENERGY
+        self._rows, self._levels = every[: self._window - 1], all_levels[n:]
         self._squares = squares[n:]
         sums = self._smoother(limited(errors, CLIP)).swapaxes(0, 1)
-        return Features(window, level, sums, np.log(energy / ENERGY + LEAST_ENERGY))
+        return Features(window, level, sums, np.log(energy + LEAST_ENERGY))
 
 
-def _sum(terms: list[Floats]) -> Floats:
-    total = terms[0]
-    for term in terms[1:]:
-        total = total + term
-    return total
+def _sums(rows: Floats, count: int) -> Floats:
+    """Return the sum of each row (N + count - 1, D) and those before it, oldest first: (N, D)."""
+    shape, strides = (count, len(rows) - count + 1, rows.shape[1]), (rows.strides[0], *rows.strides)
+    lags: Floats = np.ndarray(shape, rows.dtype, rows, 0, strides)
+    return np.asarray(np.add.reduce(lags, axis=0), np.float64)
 
 
 class PanelMember(ABC):
@@ -141,7 +143,14 @@ class PanelMember(ABC):
 
     def lengths(self, features: Floats) -> Floats:
         """Return lengths of features: (N, F) to (N,)."""
-        return self.differences(features)[0]
+        if len(features) <= CHUNK:
+            return self._lengths(features)
+        chunks = [features[i : i + CHUNK] for i in range(0, len(features), CHUNK)]
+        return np.concatenate([self._lengths(chunk) for chunk in chunks])
+
+    @abstractmethod
+    def _lengths(self, features: Floats) -> Floats:
+        """Return lengths of few features, (N, F) to (N,)."""
 
     @abstractmethod
     def arrays(self) -> Arrays:
@@ -183,11 +192,10 @@ class _Mahalanobis(PanelMember):
         contributed = centred * product(whitened, self.root_.T, ROWS)
         return np.sqrt((whitened * whitened).sum(axis=1)), contributed
 
-    def lengths(self, features: Floats) -> Floats:
-        """Return lengths of features: (N, F) to (N,)."""
+    def _lengths(self, features: Floats) -> Floats:
         whitened = product(features - self.centre_, self.root_, ROWS)
-        lengths: Floats = np.sqrt((whitened * whitened).sum(axis=1))
-        return lengths
+        whitened *= whitened
+        return np.sqrt(np.add.reduce(whitened, axis=1))
 
     def arrays(self) -> Arrays:
         """Return what `restore` takes."""
@@ -268,10 +276,13 @@ class Pattern(PanelMember):
 
     def differences(self, features: Floats) -> tuple[Floats, Floats]:
         """Return lengths (N,), and what each feature contributes to their squares, (N, F)."""
-        centred = features - self.centre_
-        left = centred - product(product(centred, self.components_, ROWS), self._back, ROWS)
-        squares = left * left
-        return np.sqrt(squares.sum(axis=1)), squares
+        left = features - self.centre_
+        left -= product(product(left, self.components_, ROWS), self._back, ROWS)
+        left *= left
+        return np.sqrt(np.add.reduce(left, axis=1)), left
+
+    def _lengths(self, features: Floats) -> Floats:
+        return self.differences(features)[0]
 
     def arrays(self) -> Arrays:
         """Return what `restore` takes."""
@@ -316,23 +327,28 @@ class NeighbourDistance(PanelMember):
         inside = product(query, self.components_.T, ROWS)
         return self._means(squares), (inside - middle) ** 2
 
-    def lengths(self, features: Floats) -> Floats:
-        """Return lengths of features: (N, F) to (N,)."""
-        lengths = np.empty(len(features))
-        for i in range(0, len(features), 4096):
-            query = product(features[i : i + 4096] - self.centre_, self.components_, ROWS)
-            lengths[i : i + 4096] = self._means(self._distances(query))
-        return lengths
+    def _lengths(self, features: Floats) -> Floats:
+        query = product(features - self.centre_, self.components_, ROWS)
+        return self._means(self._distances(query))
 
     def _distances(self, query: Floats) -> Floats:
-        squares: Floats = (query * query).sum(axis=1, keepdims=True) + self._squares
+        length: Floats = np.add.reduce(query * query, axis=1, keepdims=True)
+        squares = length + self._squares
         squares += product(query, self._doubled, ROWS)
         return squares
 
     def _means(self, squares: Floats) -> Floats:
-        nearest = np.partition(squares, self._nearest - 1, axis=1)[:, : self._nearest]
-        distances: Floats = np.sqrt(np.maximum(np.sort(nearest, axis=1), 0.0)).mean(axis=1)
-        return distances
+        if len(squares) == 1:  # as streams have it: a few searches take less than a partition
+            (row,), nearest = squares, np.empty((1, self._nearest))
+            for n in range(self._nearest):
+                nearest[0, n] = row[least := row.argmin()]
+                row[least] = np.inf
+        else:
+            nearest = np.partition(squares, self._nearest - 1, axis=1)[:, : self._nearest]
+            nearest.sort(axis=1)
+        np.maximum(nearest, 0.0, out=nearest)
+        np.sqrt(nearest, out=nearest)
+        return np.add.reduce(nearest, axis=1) / self._nearest
 
     def arrays(self) -> Arrays:
         """Return what `restore` takes."""

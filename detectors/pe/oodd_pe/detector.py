@@ -245,7 +245,8 @@ class ProbabilisticEnsemble(LongFitDetector):
         it has a chance of about 1 / (n + 1), and no deviation of a standard normal that is less
         likely is evidence of more.
         """
-        moved = (now - self.units_.sensors.mean)[:, self.units_.constant] / CONSTANT
+        constant = self.units_.constant
+        moved = (now[:, constant] - self.units_.sensors.mean[constant]) / CONSTANT
         size = np.minimum(np.sqrt(2.0 * np.log1p(moved**2)), self.largest_change_)
         changed: Floats = np.sign(moved) * size
         return changed
@@ -263,7 +264,7 @@ class ProbabilisticEnsemble(LongFitDetector):
 
     def _evidence(self, steps: Transitions, judged: Assessment) -> Evidence:
         movement, residuals = self.units_.changes(steps.now, steps.before), judged.residuals
-        if residuals.shape[1] < len(self.units_.constant):
+        if len(self.units_.constant):
             residuals = np.concatenate([residuals, self._changed(steps.now)], axis=1)
         return Evidence(
             residuals,

@@ -69,8 +69,8 @@ class DensityEnsemble:
         for start in range(0, len(x), BLOCK):
             rows = slice(start, start + BLOCK)
             forecast = self._forecast(x[rows], y[:, rows])
-            residual[rows] = forecast.residual.mean(axis=0).T
-            log_tail[rows] = forecast.log_tail.mean(axis=0).T
+            residual[rows] = (np.add.reduce(forecast.residual) / len(y)).T
+            log_tail[rows] = (np.add.reduce(forecast.log_tail) / len(y)).T
         return residual, log_tail
 
     def each(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
@@ -136,4 +136,7 @@ class DensityEnsemble:
 def _silu(x: Floats) -> Floats:
     """Return x / (1 + exp(-x)), by a function that never overflows."""
     half: Floats = 0.5 * x
-    return half + half * np.tanh(half)
+    activated = np.tanh(half)
+    activated *= half
+    activated += half
+    return np.asarray(activated, np.float64)

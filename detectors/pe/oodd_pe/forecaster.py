@@ -105,11 +105,9 @@ class Units:
         self.window = window
 
     @functools.cached_property
-    def constant(self) -> NDArray[np.bool_]:
-        """Whether each of all sensors did not vary in training, (sensors,)."""
-        constant = np.ones(len(self.sensors.mean), dtype=bool)
-        constant[self.varying] = False
-        return constant
+    def constant(self) -> NDArray[np.int64]:
+        """Indices of the sensors that are constant in training."""
+        return np.setdiff1d(np.arange(len(self.sensors.mean)), self.varying)
 
     @property
     def width(self) -> int:
@@ -129,7 +127,7 @@ class Units:
         window, actions, steps = known
         scale, n = self.sensors, len(window)
         z = limited((window - scale.mean) / scale.std, LIMIT)
-        if len(self.varying) < len(self.constant):
+        if len(self.constant):
             z = z[:, :, self.varying]
         parts = [z[:, 0], (z[:, :-1] - z[:, 1:]).reshape(n, -1)]
         if self.commands is not None and actions is not None:
@@ -143,7 +141,7 @@ class Units:
     def changes(self, now: NDArray[np.float32], before: NDArray[np.float32]) -> Floats:
         """Return changes of the varying sensors, in training standard deviations: (N, D)."""
         change: Floats = (now.astype(np.float64) - before) / self.sensors.std
-        return change if len(self.varying) == len(self.constant) else change[:, self.varying]
+        return change[:, self.varying] if len(self.constant) else change
 
     def arrays(self) -> Arrays:
         """Return what `restored` takes, but for the sensors' scale."""

@@ -215,8 +215,7 @@ class RareEvents:
         start, length = (v[self.wide_regions_(places), 0] for v in self.wide_tails_)
         beyond = (np.log(np.maximum(squares, CONSTANT)) / 2 - start) / length
         improbability = beyond - math.log(1.0 - USUAL_LENGTH)
-        counts: Floats = np.clip((improbability - COUNTS) * shares, 0.0, LARGEST)
-        return counts
+        return np.minimum(np.maximum((improbability - COUNTS) * shares, 0.0), LARGEST)
 
     def _squares(self, sizes: Floats, regions: NDArray[np.int64]) -> Floats:
         """Return squared lengths of normal numbers as improbable as sizes of residuals, (N,)."""

@@ -134,7 +134,7 @@ class Charts:
     def columns(self, evidence: Evidence) -> Floats:
         """Return centred residuals and their energy, (N, C)."""
         u = self.standardized(evidence) - self.centre_
-        energy = np.minimum(u**2, ENERGY).mean(axis=1, keepdims=True)
+        energy = np.add.reduce(np.minimum(u**2, ENERGY), axis=1, keepdims=True) / u.shape[1]
         return np.concatenate([u, energy - self.energy_], axis=1)
 
     def share(self, movement: Floats) -> Floats:
