@@ -184,8 +184,8 @@ class ProbabilisticEnsemble(LongFitDetector):
     def chart(self, pieces: Sequence[Transitions], judged: Sequence[Assessment | None]) -> None:
         """Learn the charts from what the forecaster's `fit` returned for pieces.
 
-        `nominal_statistics_` are then the statistics of their steps, (N,), of residuals that were
-        made out of fold.
+        `nominal_statistics_` are then the statistics of each, (N,), of residuals that were made out
+        of fold.
         """
         known = [(p, j) for p, j in zip(pieces, judged, strict=True) if j is not None]
         evidence = [self._evidence(*pair) for pair in known]
@@ -195,11 +195,10 @@ class ProbabilisticEnsemble(LongFitDetector):
             [j.residuals for _, j in known],
             [self.charts_.share(e.movement) for e in evidence],
         )
-        statistics = [
+        self.nominal_statistics_ = [
             _Sums(self)(p, e, self.charts_.columns(e))
             for (p, _), e in zip(known, evidence, strict=True)
         ]
-        self.nominal_statistics_ = np.concatenate(statistics)
 
     def pieces(self, usable: Sequence[Trajectory]) -> tuple[list[Transitions], list[int]]:
         """Return pieces of episodes in random order, and the fold of each.
