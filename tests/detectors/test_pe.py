@@ -10,7 +10,7 @@ from oodd_pe import make_pe
 from oodd_pe.ensemble import BLOCK, DensityEnsemble
 from oodd_pe.forecaster import Transitions
 from oodd_pe.network import LEAST_SCALES, DensityNetworks, rounds, train
-from oodd_pe.rare import COUNTS, LARGEST, MOST, Leaks, RareEvents, Regions, Tails
+from oodd_pe.rare import COUNTS, LARGEST, STEEP, Leaks, RareEvents, Regions, Tails
 from oodd_pe.statistic import RETURN, Charts, Evidence, Onsets, Running, deviance
 from scipy import stats
 from sklearn.tree import DecisionTreeRegressor
@@ -403,7 +403,8 @@ def test_improbability_is_that_of_exponential_tails():
 def test_leaky_sums_by_hand():
     leaks = Leaks([0.5, 0.1], np.array([1.0, 4.0]), np.array([3.0, 50.0]))
     # Sums of 2 and 3 (of 5), of 2 and 5.8, each less 1, over usual ones less 1.
-    np.testing.assert_allclose(leaks(np.array([2.0, 4.0])), [[1.0, 2.0], [0.25, 1.2]])
+    squeezed = STEEP * (1 + math.log(2.0 / STEEP))
+    np.testing.assert_allclose(leaks(np.array([2.0, 4.0])), [[1.0, squeezed], [0.25, 1.2]])
     np.testing.assert_allclose(leaks(np.array([0.0])), [[0.5], [1.055]])
 
 
@@ -411,8 +412,13 @@ def test_leaky_sums_come_down_when_a_fault_has_ended(events):
     leaks = events.running()
     highest = leaks(np.full(300, LARGEST))[:, -1]
     assert (highest > 1.2).all()
-    assert highest.max() == pytest.approx(MOST)
     assert (leaks(np.zeros(RETURN))[:, -1] <= 1 + 1e-9).all()
+
+
+def test_no_sum_is_so_large_that_a_larger_one_is_not_told_from_it(events):
+    units = events.running()(np.full(60, LARGEST)).max(axis=0)
+    assert units[-1] > 2 * STEEP
+    assert (np.diff(units[units > STEEP]) > 0).all()
 
 
 def test_rare_faults_that_no_covariance_tells_are_found(events):

@@ -388,7 +388,9 @@ class PanelDetector(LongFitDetector):
         for voice in self._new_voices():
             if of_voice := voice.fit(visible):
                 self.voices_[voice.name] = voice
-                self.scales_[voice.name] = VoiceScale().fit(of_voice).brought_to(members)
+                self.scales_[voice.name] = (
+                    VoiceScale().fit(of_voice).brought_to(members, voice.weight)
+                )
         return scale
 
     def _new_voices(self) -> list[Voice]:

@@ -36,6 +36,11 @@ LEAST_SCALE: Final = 0.02
 """Least scale of a tail, relative to where it begins."""
 SMALLEST: Final = 1e-9
 """Statistics below this are none."""
+MEMBERS_WEIGHT: Final = 0.6
+"""Weight of the members beside other voices.
+
+They add little where these have something to say, and an episode in which they are loud costs all.
+"""
 FEWEST: Final = 5
 """Episodes below which stretches of rows stand for them."""
 CHARTS: Final = "charts"
@@ -90,9 +95,9 @@ class VoiceScale:
         """Return surprises on the panel's scale: (N,) to (N,)."""
         return self.factor_ * self.surprise(values)
 
-    def brought_to(self, other: VoiceScale) -> Self:
-        """Take the unit of another scale, so that both exceed it in equally few episodes."""
-        self.factor_ = np.asarray(other.unit_ / self.unit_)
+    def brought_to(self, other: VoiceScale, weight: float) -> Self:
+        """Take the unit of another scale: both exceed it in equally few episodes at weight 1."""
+        self.factor_ = np.asarray(weight * other.unit_ / self.unit_)
         return self
 
     def arrays(self) -> Arrays:
@@ -127,6 +132,8 @@ class Voice(ABC):
     """
 
     name: ClassVar[str]
+    weight: ClassVar[float] = 1.0 / MEMBERS_WEIGHT
+    """Weight of its surprises, where the members' have 1."""
 
     @abstractmethod
     def fit(self, episodes: Sequence[Trajectory]) -> list[Floats]:

@@ -71,7 +71,7 @@ class ProbabilisticEnsemble(LongFitDetector):
     Rigdon, "A multivariate exponentially weighted moving average control chart" (1992).
     """
 
-    kind: ClassVar[str] = "pe/3"
+    kind: ClassVar[str] = "pe/4"
 
     def __init__(
         self,

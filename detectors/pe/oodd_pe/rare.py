@@ -38,11 +38,11 @@ LARGEST: Final = 4.0
 """Limit of what a step counts: how improbable a step is beyond that, no tail can tell."""
 NOMINAL: Final = 1.0
 """Usual sum of a hundred nominal steps: one of them counts, on average by one."""
-MOST: Final = 3.0
-"""Limit of the chart, in units of what is usual for an episode's largest.
+STEEP: Final = 1.5
+"""Units of what is usual for an episode's largest beyond which the chart grows by its logarithm.
 
 Errors of a model repeat from step to step where those of noise do not. A nominal episode that
-comes to where training has hardly been would have the largest sum of all.
+comes to where training has hardly been has a sum of many units, without being as odd as that.
 """
 
 
@@ -231,8 +231,7 @@ class RareEvents:
         Like those of residuals they fall to what is usual within `RETURN` steps, wherever they are.
         """
         kept = np.maximum((1.0 - np.asarray(self.memories)) ** RETURN, CONSTANT)
-        falling, most = (NOMINAL + self.excess_) / kept, NOMINAL + MOST * self.excess_
-        return Leaks(self.memories, self.excess_, np.minimum(falling, most))
+        return Leaks(self.memories, self.excess_, (NOMINAL + self.excess_) / kept)
 
     def arrays(self) -> Arrays:
         """Return what `restore` takes."""
@@ -279,4 +278,6 @@ class Leaks:
             for n, (keep, limit) in enumerate(zip(self._keep, self._limits, strict=True)):
                 self._sums[n] = min(keep * self._sums[n] + count, limit)
             sums[:, t] = self._sums
-        return (sums - NOMINAL) / self._excess
+        units = (sums - NOMINAL) / self._excess
+        beyond = np.maximum(units, STEEP)
+        return np.minimum(units, STEEP + STEEP * np.log(beyond / STEEP))
