@@ -273,6 +273,9 @@ class DetectorSpec:
         ``"scikit-learn.1.9.1"``: scores of another version are not taken for these.
     horizon_decides_fit
         Whether the horizon changes the fitted detector; if not, one saved fit serves all horizons.
+    seconds
+        About how long a fit takes on the split ``mini``: a run begins long fits first. 0 stands for
+        10 where the detector `requires` further modules.
     fit_name
         Detectors of one plug-in with the same name here share fits; default `name`.
     """
@@ -294,6 +297,7 @@ class DetectorSpec:
     extra: str = ""
     version: str = ""
     horizon_decides_fit: bool = True
+    seconds: float = 0.0
     fit_name: str = ""
 
 

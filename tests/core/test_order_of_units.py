@@ -10,8 +10,9 @@ from types import SimpleNamespace
 
 import pytest
 
+from oodd_eval.plugins.contract import DetectorSpec
 from oodd_eval.scoring.executors import RunSettings
-from oodd_eval.scoring.runner import _as_they_finish
+from oodd_eval.scoring.runner import _as_they_finish, _turn
 from oodd_eval.scoring.unit import Scored, groups
 
 
@@ -71,6 +72,29 @@ def test_units_begin_in_the_order_of_the_plan():
     executor = Executor()
     assert finish("a b c", executor) == [0, 1, 2]
     assert executor.begun == ["a", "b", "c"]
+
+
+def test_long_fits_begin_first_behind_a_quick_one_of_the_first_environment():
+    specs = {
+        "quick": DetectorSpec("quick", list, ""),
+        "trained": DetectorSpec("trained", list, "", requires=("torch",)),
+        "long": DetectorSpec("long", list, "", seconds=30),
+        "here": DetectorSpec("here", list, "", seconds=90),
+    }
+    plugins = SimpleNamespace(offer=lambda name: SimpleNamespace(spec=specs[name]))
+    units = [
+        SimpleNamespace(
+            environment=environment, setting=SimpleNamespace(detector=name), local=name == "here"
+        )
+        for environment in ("ant", "hopper")
+        for name in ("here", "trained", "quick", "long")
+    ]
+    plan = SimpleNamespace(units=units)
+    turns = sorted(units, key=lambda unit: _turn(plan, unit, plugins))
+    assert [f"{unit.environment} {unit.setting.detector}" for unit in turns] == [
+        "ant quick", "ant long", "hopper long", "ant trained", "hopper trained", "hopper quick",
+        "ant here", "hopper here",
+    ]  # fmt: skip
 
 
 def test_shares_of_fits_are_heard_in_the_thread_that_asks():

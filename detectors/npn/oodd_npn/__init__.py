@@ -35,5 +35,6 @@ def oodd_detectors() -> list[DetectorSpec]:
             parameters=NetworkParameters,
             requires=("torch",),
             extra="oodd-eval[reference]",
+            seconds=40,
         )
     ]

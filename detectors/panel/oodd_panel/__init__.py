@@ -74,5 +74,6 @@ def _spec(*, name: str, summary: str) -> DetectorSpec:
         with_actions="" if actions else "panel-a",
         alarm="score",
         adapts="baseline",
+        seconds=35,
         parameters=PanelParameters if actions else WithoutActions,
     )

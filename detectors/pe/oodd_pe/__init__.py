@@ -78,5 +78,6 @@ def _spec(*, name: str, summary: str) -> DetectorSpec:
         parameters=PeParameters,
         requires=("torch", "sklearn"),
         extra="oodd-eval[reference]",
+        seconds=30,
         fit_name="pe-a" if actions else "pe",
     )

@@ -75,6 +75,7 @@ def oodd_detectors() -> list[DetectorSpec]:
         "reference": "Danesh & Fern (2021), Out-of-Distribution Dynamics Detection, section 3",
         "requires": ("torch",),
         "extra": "oodd-eval[reference]",
+        "seconds": 20,
     }
     return [
         DetectorSpec(

@@ -106,6 +106,7 @@ def oodd_detectors() -> list[DetectorSpec]:
             horizon_decides_fit=False,
             requires=("torch", "sklearn"),
             extra="oodd-eval[reference]",
+            seconds=20,
         ),
         *_networks(),
     ]
@@ -114,7 +115,7 @@ def oodd_detectors() -> list[DetectorSpec]:
 def _networks() -> list[DetectorSpec]:
     """Return the rivals that train networks."""
     flow = "Xu et al. (2025), FAIL-Detect, logpZO"
-    torch: dict[str, Any] = {"requires": ("torch",), "extra": "oodd-eval[reference]"}
+    torch: dict[str, Any] = {"requires": ("torch",), "extra": "oodd-eval[reference]", "seconds": 30}
     return [
         _spec(
             name="rpt-a",
@@ -151,6 +152,6 @@ def _networks() -> list[DetectorSpec]:
             reference="Zollicoffer et al. (2025), novelty detection with world models",
             inputs="observations+actions",
             horizon_decides_fit=False,
-            **torch,
+            **torch | {"seconds": 90},
         ),
     ]
