@@ -16,6 +16,7 @@ from oodd_panel.constants import (
     moving_of,
     share_of_noise,
 )
+from oodd_panel.detector import PanelDetector
 from oodd_panel.forecast import (
     EpisodeLearner,
     LinearForecast,
@@ -34,6 +35,7 @@ from oodd_panel.members import (
     Sums,
 )
 from oodd_panel.surprise import SurpriseScale
+from oodd_panel.voices import Voice, VoiceScale
 from oodd_pe import make_pe
 from sklearn.decomposition import PCA
 from sklearn.neighbors import NearestNeighbors
@@ -323,6 +325,90 @@ def test_a_tail_of_few_values_is_drawn_to_the_common_scale():
         scale.draw(2.0)
     assert few.relative() == pytest.approx(few_alone ** (10 / 210) * 2.0 ** (200 / 210))
     assert many.relative() == pytest.approx(many_alone, rel=0.05)
+
+
+# Voices
+
+
+class Column(Voice):
+    """The size of one sensor's readings as a voice."""
+
+    def __init__(self, column):
+        self.name, self.column = f"column {column}", column
+
+    def fit(self, episodes):
+        return [self.rows(x) for x in episodes]
+
+    def rows(self, episode):
+        return np.abs(episode.observations[1:, self.column]).astype(float)
+
+    def shares(self, episode):
+        return np.tile(np.eye(episode.observation_dim)[self.column], (episode.transitions, 1))
+
+    def reset(self):
+        self.t = -1
+
+    def update(self, observation, action):
+        self.t += 1
+        return np.nan if self.t == 0 else abs(float(observation[self.column]))
+
+    def shares_last(self):
+        return np.eye(2)[self.column]
+
+    def state(self):
+        return {"column": self.column}
+
+    def restore(self, state):
+        assert state["column"] == self.column
+
+
+def spoilt(seed, by=0.0):
+    """Two sensors, of which the second has a heavy tail in a tenth of the episodes."""
+    rng = np.random.default_rng([seed, 6])
+    rows = rng.normal(size=(200, 2))
+    if seed % 10 == 0:
+        rows[rng.integers(20, 180) :][:8, 1] *= 1e3 * np.exp(rng.normal())
+    rows[120:, 0] += by
+    return Trajectory(rows)
+
+
+def test_a_voice_with_a_heavy_tail_does_not_set_the_threshold(monkeypatch):
+    columns = lambda _: [Column(0), Column(1)]  # noqa: E731  in place of a method
+    monkeypatch.setattr(PanelDetector, "_new_voices", columns)
+    panel = make_panel(forecast="linear").fit([spoilt(seed) for seed in range(40)])
+    nominal = [panel.voices(spoilt(seed)) for seed in range(40, 80)]
+    faulty = [panel.voices(spoilt(seed, by=5.0)) for seed in range(81, 90)]
+
+    def share(of):
+        largest = sorted(np.nanmax(of(said)) for said in nominal)
+        return np.mean([np.nanmax(of(said)[120:140]) > largest[38] for said in faulty])
+
+    good = share(lambda said: said["column 0"])
+    assert good > 0.9
+    assert share(lambda said: np.max([*said.values()], axis=0)) >= good
+    assert share(lambda said: said["column 1"]) < 0.1
+    test = spoilt(81, by=5.0)
+    assert (panel.explain(test).shares[125:, 0] == 1).all()
+    restored = make_panel(forecast="linear")
+    restored.restore(panel.state())
+    streamed = [restored.update(row) for row in test.observations]
+    np.testing.assert_array_equal(streamed, panel.score(test))
+    assert restored.explain_last()[0].tolist() == [1.0, 0.0]
+
+
+def test_a_scale_tells_values_beyond_all_nominal_ones_apart():
+    rng = np.random.default_rng(30)
+    scale = VoiceScale().fit([rng.exponential(size=200) for _ in range(40)])
+    surprises = scale(np.array([1.0, 5.0, 20.0, 40.0]))
+    # Of an exponential distribution the surprise is the value; the largest of 200 is about 6.
+    np.testing.assert_allclose(surprises[:2], [1.0, 5.0], rtol=0.1)
+    assert (np.diff(surprises) > 1.0).all()
+    assert float(scale.unit_) == pytest.approx(7.2, rel=0.1)
+    heavy = VoiceScale().fit([np.exp(2 * rng.exponential(size=200)) for _ in range(40)])
+    assert heavy.tail_[0] >= 0.8
+    assert float(heavy.unit_) == pytest.approx(7.2, rel=0.2)
+    few = VoiceScale().fit([np.arange(100.0)])
+    assert np.isfinite(few(np.array([-np.inf, 0.0, 1e6]))).all()
 
 
 # The panel
