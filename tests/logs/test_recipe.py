@@ -39,6 +39,8 @@ clock = false
 order = "shuffled"
 seed = 4
 paired = false
+[roles]
+angle = "q6"
 [read]
 format = "csv"
 separator = ";"

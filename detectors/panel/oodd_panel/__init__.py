@@ -4,6 +4,7 @@ Two rows, which differ in what they look at: `panel` at observations alone, `pan
 commanded actions too. Where episodes have actions, `panel-a` runs in place of `panel`.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -36,7 +37,13 @@ class WithoutActions(PanelParameters):
 
 
 def make_panel(
-    name: str = "panel", *, seed: int = 0, horizon: int = 1, baseline: int = 0, **parameters: Any
+    name: str = "panel",
+    *,
+    seed: int = 0,
+    horizon: int = 1,
+    baseline: int = 0,
+    roles: Sequence[str] = (),
+    **parameters: Any,
 ) -> Detector:
     """Return an unfitted `oodd_panel.detector.PanelDetector`, by the name of its row."""
     from oodd_panel.detector import PanelDetector  # noqa: PLC0415  keeps the listing quick
@@ -49,6 +56,7 @@ def make_panel(
         horizon=horizon,
         actions=actions,
         baseline=baseline,
+        roles=roles,
     )
 
 
@@ -75,5 +83,6 @@ def _spec(*, name: str, summary: str) -> DetectorSpec:
         alarm="score",
         adapts="baseline",
         seconds=35,
+        roles=True,
         parameters=PanelParameters if actions else WithoutActions,
     )

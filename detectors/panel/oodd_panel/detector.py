@@ -32,6 +32,7 @@ from oodd_panel.forecast import (
     chosen_ridge,
     regressors,
 )
+from oodd_panel.frame import FrameVoice
 from oodd_panel.members import MEMBERS, Features, Latest, PanelMember, Pattern, window_of
 from oodd_panel.surprise import SurpriseScale
 from oodd_panel.voices import MEMBERS_VOICE, EnsembleVoice, Voice, VoiceScale
@@ -83,6 +84,8 @@ class PanelDetector(LongFitDetector):
     baseline
         Number of rows at the start of every episode that are nominal. Mean and spread of each
         sensor over them are brought to training's; their scores are 0.
+    roles
+        Of the sensors, see `oodd_eval.Quantity`; empty where they are not known.
 
     Notes
     -----
@@ -105,8 +108,9 @@ class PanelDetector(LongFitDetector):
         horizon: int,
         actions: bool,
         baseline: int = 0,
+        roles: Sequence[str] = (),
     ) -> None:
-        self.baseline = baseline
+        self.baseline, self.roles = baseline, tuple(roles)
         super().__init__(name, seed=seed, horizon=horizon, window=LAGS, actions=actions)
         self.parameters = parameters
         self.members_: list[PanelMember] = [member() for member in MEMBERS]
@@ -395,7 +399,7 @@ class PanelDetector(LongFitDetector):
 
     def _new_voices(self) -> list[Voice]:
         """Return unfitted voices, each of which may ask for what those before it are."""
-        return [ConstantsVoice(self), EnsembleVoice(self)]
+        return [ConstantsVoice(self), EnsembleVoice(self), FrameVoice(self)]
 
     def _fitted(
         self, episodes: Sequence[tuple[Floats, StandardEpisode]], ridge: float, *, varies: bool
@@ -455,7 +459,12 @@ class PanelDetector(LongFitDetector):
         super().restore({name: value for name, value in state.items() if ":" not in name})
 
     def _fitted_with(self) -> dict[str, Any]:
-        return {"actions": self.actions, "horizon": self.horizon, "baseline": self.baseline}
+        return {
+            "actions": self.actions,
+            "horizon": self.horizon,
+            "baseline": self.baseline,
+            "roles": [*self.roles],
+        }
 
     def _arrays(self) -> Arrays:
         arrays: dict[str, NDArray[Any]] = {
