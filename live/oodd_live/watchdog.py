@@ -608,9 +608,9 @@ class Watchdog:
             standardization,
             tuple(map(float, calibration_values["largest"])),
             int(calibration_values["episodes"]),
-            bool(calibration_values["rolling"]),
             tuple(map(int, calibration_values["recordings"])),
             int(calibration_values["recording_count"]),
+            bool(calibration_values["rolling"]),
         )
         setting_values = values["settings"]
         settings = Settings(

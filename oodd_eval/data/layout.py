@@ -364,14 +364,14 @@ def recordings_of(entry: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
     """Return numbers of recordings, one an episode, by part; `SplitError` for other numbers."""
     recordings = {}
     for part, text in entry.get("recordings", {}).items():
-        runs = [run.split("x") for run in text.split()]
-        expected = entry["groups"].get(part, {}).get("trajectories")
-        if sum(int(n) for _, n in runs) != expected:
+        runs = [(number, int(n)) for number, n in (run.split("x") for run in text.split())]
+        expected = entry["groups"][part]["trajectories"] if part in entry["groups"] else "no"
+        if sum(n for _, n in runs) != expected:
             raise SplitError(
                 f"{entry['file']}: the recordings of {part} are not those of {expected} episodes: "
                 "import it again"
             )
-        recordings[part] = tuple(number for number, n in runs for _ in range(int(n)))
+        recordings[part] = tuple(number for number, n in runs for _ in range(n))
     return recordings
 
 

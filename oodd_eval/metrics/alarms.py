@@ -94,20 +94,7 @@ class GuaranteedAlarm:
             Where no statistic could exceed the threshold, because there are too few episodes for
             the level, or too many of them have an infinite statistic.
         """
-        return cls.fits(calibration, [level], kind, confidence, recordings)[0]
-
-    @classmethod
-    def fits(
-        cls,
-        calibration: Sequence[Floats],
-        levels: Sequence[float],
-        kind: AlarmKind = "cusum",
-        confidence: float | None = None,
-        recordings: Sequence[Hashable] | None = None,
-    ) -> "list[GuaranteedAlarm]":
-        """Find the thresholds of several levels as `fit` does, each episode's statistic once."""
-        fitted_calibration = Calibration.fit(calibration, kind, recordings)
-        return [fitted_calibration.rule(level, confidence) for level in levels]
+        return Calibration.fit(calibration, kind, recordings).rule(level, confidence)
 
     def statistic(self, scores: Floats) -> Floats:
         """Return the statistic of an episode, row by row; minus infinity where there is none."""
@@ -139,13 +126,13 @@ class Calibration:
         Largest statistic of each of the n episodes that the quantile is of, as recorded.
     episodes
         Number of all episodes, those that standardize the scores included.
+    recordings
+        Number of the recording that each of the n episodes is a window of.
+    recording_count
+        Number of all recordings, those that standardize the scores included.
     rolling
         Whether an episode counts `FADING` to the power of its age, the number of recordings after
         its own.
-    recordings
-        Number of the recording that each of the n episodes is a window of; empty where each is one.
-    recording_count
-        Number of all recordings, those that standardize the scores included; 0 for one an episode.
 
     Examples
     --------
@@ -158,9 +145,9 @@ class Calibration:
     standardization: Standardization | None
     largest: tuple[float, ...]
     episodes: int
+    recordings: tuple[int, ...]
+    recording_count: int
     rolling: bool = False
-    recordings: tuple[int, ...] = ()
-    recording_count: int = 0
 
     @classmethod
     def fit(
@@ -187,24 +174,15 @@ class Calibration:
         Calibration
         """
         numbers = numbered(recordings, len(scores))
-        count = len({*numbers.tolist()})
         standardization, episodes = None, np.arange(len(scores))
         if kind == "cusum":
             standardizing, episodes = halves(numbers)
             standardization = Standardization.fit([scores[i] for i in standardizing])
         unbounded = GuaranteedAlarm(standardization, math.inf)
         largest = tuple(unbounded.largest(scores[i]) for i in episodes)
-        if recordings is None:
-            return cls(kind, standardization, largest, len(scores))
-        of_largest = tuple(numbers[episodes].tolist())
-        return cls(
-            kind,
-            standardization,
-            largest,
-            len(scores),
-            recordings=of_largest,
-            recording_count=count,
-        )
+        count = len({*numbers.tolist()})
+        counts = len(scores), tuple(numbers[episodes].tolist()), count
+        return cls(kind, standardization, largest, *counts)
 
     @property
     def unbounded(self) -> GuaranteedAlarm:
@@ -225,33 +203,19 @@ class Calibration:
         -------
         Calibration
         """
-        numbers = self.numbers
-        number = max(numbers, default=-1) + 1 if recording is None else recording
-        is_new = number not in numbers
-        recordings = () if is_new and not self.recordings else (*numbers, number)
+        number = max(self.recordings, default=-1) + 1 if recording is None else recording
         return replace(
             self,
             largest=(*self.largest, largest),
             episodes=self.episodes + 1,
+            recordings=(*self.recordings, number),
+            recording_count=self.recording_count + (number not in self.recordings),
             rolling=True,
-            recordings=recordings,
-            recording_count=(self.recording_count or self.episodes) + is_new if recordings else 0,
         )
 
-    @property
-    def numbers(self) -> tuple[int, ...]:
-        """Number of the recording of each of the n episodes."""
-        return self.recordings or tuple(range(len(self.largest)))
-
     def no_promise(self, level: float, confidence: float | None = None) -> str:
-        """Return why a threshold of a level promises nothing: see `no_promise`."""
-        if not self.recordings:
-            return ""
-        n = len({*self.recordings})
-        if self.rolling and n < (least := least_rolling(level)):
-            return _no_promise(self.episodes, self.recording_count, level, least)
-        count = self.recording_count
-        return no_promise(self.episodes, count, level, self.kind, confidence)
+        """Return why a threshold of a level promises nothing; empty where it does."""
+        return no_promise(self.episodes, self.recording_count, level, self.kind, confidence)
 
     def threshold(self, level: float, confidence: float | None = None) -> float:
         """Return the threshold of a level; infinite where no number could promise it.
@@ -272,10 +236,10 @@ class Calibration:
         float
         """
         # Where recordings are too few for the level, their windows count, and nothing is promised.
-        counts_windows = bool(self.no_promise(level, confidence))
-        units = range(len(self.largest)) if counts_windows else self.numbers
-        present, unit = np.unique(np.array(units, np.intp), return_inverse=True)
-        n = len(present)
+        unit = np.arange(len(self.largest))
+        if not self.no_promise(level, confidence):
+            unit = np.unique(np.array(self.recordings, np.intp), return_inverse=True)[1]
+        n = int(unit.max(initial=-1)) + 1
         if confidence is not None:
             tops = np.full(n, -math.inf)
             np.maximum.at(tops, unit, self.largest)
@@ -309,11 +273,12 @@ class Calibration:
         if not math.isinf(threshold):
             return GuaranteedAlarm(self.standardization, threshold)
         subject = f"at most {100 * level:.3g} % of nominal episodes with an alarm"
-        if len(self.largest) < (n := least_rolling(level)) and self.rolling:
+        count = len({*self.recordings})
+        if count < (n := least_rolling(level)) and self.rolling:
             no_number = "is more than any number can promise"
             needed = f"needs {n} episodes" if math.isfinite(n) else no_number
             raise UsageError(
-                f"a rolling calibration {needed} at {100 * level:.3g} %, got {len(self.largest)}: "
+                f"a rolling calibration {needed} at {100 * level:.3g} %, got {count}: "
                 "keep the first calibration, or promise less"
             )
         if self.episodes < least_episodes(level, self.kind, confidence):
@@ -398,13 +363,7 @@ def halves(numbers: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp
 
 
 def no_promise(
-    windows: int,
-    recordings: int,
-    level: float,
-    kind: AlarmKind,
-    confidence: float | None = None,
-    *,
-    rolling: bool = False,
+    windows: int, recordings: int, level: float, kind: AlarmKind, confidence: float | None = None
 ) -> str:
     """Say that windows of so few recordings promise nothing at a level; empty where they do.
 
@@ -417,8 +376,6 @@ def no_promise(
         Largest share of nominal episodes with an alarm.
     kind, confidence
         See `GuaranteedAlarm.fit`.
-    rolling
-        Whether the calibration is to be a rolling one, which takes more.
 
     Returns
     -------
@@ -432,19 +389,11 @@ def no_promise(
     >>> no_promise(38, 18, 0.10, "cusum"), no_promise(17, 17, 0.10, "cusum")
     ('', '')
     """
-    least: float = least_episodes(level, kind, confidence)
-    if rolling:
-        least = least_rolling(level) * (1 if kind == "score" else 2)
-    is_enough = recordings >= min(windows, least)
-    return "" if is_enough else _no_promise(windows, recordings, level, least)
-
-
-def _no_promise(windows: int, recordings: int, level: float, least: float) -> str:
-    would = f"{least:g} recordings would" if math.isfinite(least) else "no number of them would"
-    return (
-        f"{counted(windows, 'window(s)')} of {counted(recordings, 'recording(s)')}: no promise at "
-        f"{100 * level:.3g} %; {would}"
-    )
+    least = least_episodes(level, kind, confidence)
+    if recordings >= min(windows, least):
+        return ""
+    counts = f"{windows} windows of {counted(recordings, 'recording(s)')}"
+    return f"{counts}: no promise at {100 * level:.3g} %; {least} recordings would"
 
 
 def too_few(
@@ -467,9 +416,7 @@ def too_few(
     )
 
 
-def missing_level(
-    episodes: int, level: float, kind: AlarmKind, recordings: int | None = None
-) -> str:
+def missing_level(episodes: int, level: float, kind: AlarmKind) -> str:
     """Say how many calibration episodes a level takes, and which weaker level these offer.
 
     Parameters
@@ -480,8 +427,6 @@ def missing_level(
         Largest share of nominal episodes with an alarm, which they are too few for.
     kind
         The statistic.
-    recordings
-        Number of the recordings that the episodes are windows of; by default as many.
 
     Returns
     -------
@@ -498,10 +443,7 @@ def missing_level(
     weaker = [share for share in offered_levels(episodes, kind).values() if share > level]
     remedy = f", or --level {100 * min(weaker):g}" if weaker else ""
     needed = f"{least_episodes(level, kind)} needed at {100 * level:g} %"
-    of_recordings = ""
-    if recordings is not None and recordings < episodes:
-        of_recordings = f", windows of {counted(recordings, 'recording(s)')}"
-    return f"{episodes} calibration episodes{of_recordings}; {needed}{remedy}"
+    return f"{episodes} calibration episodes; {needed}{remedy}"
 
 
 def rolling_rules(
@@ -537,8 +479,7 @@ def rolling_rules(
         Where a threshold would be infinite.
     """
     rules = [calibration.rule(level)]
-    for i, scores in enumerate(nominal):
-        recording = None if recordings is None else int(recordings[i])
+    for scores, recording in zip(nominal, recordings or [None] * len(nominal), strict=True):
         calibration = calibration.joined(calibration.unbounded.largest(scores), recording)
         rules.append(calibration.rule(level))
     return rules

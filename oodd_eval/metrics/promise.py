@@ -217,12 +217,8 @@ class EpisodeMeans(NamedTuple):
     def by_recording(self) -> "EpisodeMeans":
         """Return the means of recordings."""
         unit = numbered(self.recordings, len(self.lengths))
-        share = window_weights(unit)
-        means = np.zeros((self.count, self.means.shape[1]))
-        lengths = np.zeros(self.count)
-        np.add.at(means, unit, self.means * share[:, None])
-        np.add.at(lengths, unit, self.lengths * share)
-        return EpisodeMeans(means, np.rint(lengths).astype(np.int64))
+        share = (unit == np.arange(self.count)[:, None]) * window_weights(unit)
+        return EpisodeMeans(share @ self.means, np.rint(share @ self.lengths).astype(np.int64))
 
 
 NO_EPISODES: Final = EpisodeMeans(np.empty((0, 0)), np.empty(0, np.int64))
@@ -300,13 +296,11 @@ own score
     >>> print(enough_episodes(38, ["score"], 1))
     38 windows of 1 recording: no promise at 10 %; 9 recordings would
     """
-    units = n if recordings is None else min(n, recordings)
+    units = n if recordings is None else recordings
     offered = [offered_levels(units, kind) for kind in kinds]
     missing = next((s for s in LEVELS if not all(s in levels for levels in offered)), None)
     doubt = not all(HEADLINE in levels for levels in offered)
-    text = f"{n} calibration episodes: enough for all levels"
-    if units < n:
-        text = f"{n} windows of {units} recordings: enough for all levels"
+    text = f"{n} {'calibration episodes' if units == n else 'windows'}: enough for all levels"
     if missing is not None:
         level = LEVELS[missing]
         least = {kind: least_episodes(level, kind) for kind in kinds}
@@ -314,12 +308,10 @@ own score
         listed = ", ".join(needed).replace("{}", "are needed ", 1).replace("{}", "")
         text = f"{n} calibration episodes: at {100 * level:g} % {listed}"
         if units < n:
-            lacking = sorted((kind for kind in kinds if least[kind] > units), key=least.__getitem__)
-            text = no_promise(n, units, level, lacking[0])
-            if len(lacking) < len(kinds):
-                text += f" for {_name(lacking[0])}"
-            elif len(lacking) > 1:
-                text += f" ({least[lacking[1]]} for {_name(lacking[1])})"
+            first, *others = sorted((k for k in kinds if least[k] > units), key=least.__getitem__)
+            text = no_promise(n, units, level, first)
+            text += f" for {_name(first)}" * (len(others) + 1 < len(kinds))
+            text += "".join(f" ({least[kind]} for {_name(kind)})" for kind in others)
     return PromiseFinding("episodes", text, doubt)
 
 
@@ -352,12 +344,11 @@ def achieved_share(
         None where half of the episodes are too few for any level.
     """
     unit, noun = numbered(recordings, len(calibration)), "episodes"
-    count = int(unit.max(initial=-1)) + 1
-    if count < len(calibration) and offered_levels(count // 2, kind):
-        whole = [
-            [s for s, i in zip(calibration, unit, strict=True) if i == k] for k in range(count)
-        ]
-        calibration, noun = [np.concatenate(windows) for windows in whole], "recordings"
+    if (count := len({*unit.tolist()})) < len(unit) and offered_levels(count // 2, kind):
+        order, starts = np.argsort(unit, kind="stable"), np.cumsum(np.bincount(unit))[:-1]
+        windows = np.split(order, starts)
+        calibration = [np.concatenate([calibration[i] for i in of_one]) for of_one in windows]
+        noun = "recordings"
     half = len(calibration) // 2
     offered = offered_levels(half, kind)
     if not offered:

@@ -13,8 +13,8 @@ become values by a line through the order statistics on the scale ``-log(1 - lev
 lie at their expectations under an exponential tail (Rényi 1953); it goes on beyond the largest one
 with the mean excess of the upper ones as its slope.
 
-Where episodes are windows of several recordings, recordings are drawn, each with all its windows,
-which share its place among the m: there i and v count in shares of a recording.
+Where episodes are windows of several recordings, recordings are drawn. Each brings all its windows,
+which share its place among the m: i and v count in shares of a recording.
 """
 
 import functools
@@ -58,69 +58,43 @@ _ROUNDING: Final = 1e-9  # of an episode
 class Drawn(NamedTuple):
     """Drawn episodes, and where each lies in the span of its rank: both of shape (draws, n).
 
-    Draws of recordings differ in length, and are filled up with n. `halves` are the episodes that
-    standardize a CUSUM and those that its threshold is from, and `columns` those of their draws, as
-    each half is drawn within itself.
+    Episodes of even and of odd number are drawn apart, each within themselves.
     """
 
     episodes: NDArray[np.intp]
     spread: Floats
-    halves: tuple[NDArray[np.intp], NDArray[np.intp]]
-    columns: tuple[NDArray[np.intp], NDArray[np.intp]]
 
-    def half(self, i: int) -> "Drawn":
-        """Return the draws of one half, numbered among its episodes."""
-        episodes, columns = self.halves[i], self.columns[i]
-        position = np.full(sum(map(len, self.halves)) + 1, len(episodes))
-        position[episodes] = np.arange(len(episodes))
-        return self._replace(
-            episodes=position[self.episodes[:, columns]], spread=self.spread[:, columns]
-        )
+    def half(self, start: int) -> "Drawn":
+        """Return the draws of every second episode, numbered among these."""
+        return Drawn(self.episodes[:, start::2] // 2, self.spread[:, start::2])
+
+    def of_windows(self, unit: NDArray[np.intp]) -> "Drawn":
+        """Return the draws of the m windows of drawn recordings, whose numbers are their units.
+
+        Rows are filled up with the number m.
+        """
+        counts, order = np.bincount(unit), np.argsort(unit, kind="stable")
+        if len(counts) == len(unit):
+            return self
+        members = np.split(order, np.cumsum(counts)[:-1])
+        length = counts[self.episodes].sum(axis=1).max()
+        episodes, spread = np.full((DRAWS, length), len(unit)), np.zeros((DRAWS, length))
+        for i, row in enumerate(self.episodes):
+            windows = np.concatenate([members[k] for k in row])
+            episodes[i, : len(windows)] = windows
+            spread[i, : len(windows)] = np.repeat(self.spread[i], counts[row])
+        return Drawn(episodes, spread)
 
 
 @functools.lru_cache(maxsize=64)
-def drawn(environment: str, n: int, recordings: tuple[int, ...] = ()) -> Drawn:
-    """Return the resamples of an environment's n calibration episodes.
-
-    Parameters
-    ----------
-    environment, n
-        The environment, and the number of episodes.
-    recordings
-        Number of each episode's recording, of several; empty where episodes are drawn.
-
-    Returns
-    -------
-    Drawn
-    """
+def drawn(environment: str, n: int) -> Drawn:
+    """Return the resamples of an environment's n calibration episodes."""
     rng = np.random.default_rng([zlib.crc32(f"calibration of {environment}".encode()), n])
-    numbers = np.array(recordings or range(n), np.intp)
-    two = halves(numbers)
-    windows = []
-    for half in two:
-        _, unit = np.unique(numbers[half], return_inverse=True)
-        size = int(unit.max(initial=-1)) + 1
-        units = rng.integers(max(size, 1), size=(DRAWS, size))
-        windows.append(_windows(units, [half[unit == k] for k in range(size)], n))
-    columns = np.arange(n)[0::2], np.arange(n)[1::2]
-    if recordings:
-        first, second = (part.shape[1] for part in windows)
-        columns = np.arange(first), np.arange(first, first + second)
-    episodes = np.empty((DRAWS, sum(map(len, columns))), np.intp)
-    for part, positions in zip(windows, columns, strict=True):
-        episodes[:, positions] = part
-    return Drawn(episodes, rng.random(episodes.shape), two, columns)
-
-
-def _windows(
-    units: NDArray[np.intp], members: Sequence[NDArray[np.intp]], n: int
-) -> NDArray[np.intp]:
-    """Return the episodes of drawn recordings, filled up with n."""
-    rows = [np.concatenate([np.zeros(0, np.intp), *(members[k] for k in draw)]) for draw in units]
-    episodes = np.full((len(rows), max(map(len, rows))), n)
-    for row, drawn_episodes in zip(episodes, rows, strict=True):
-        row[: len(drawn_episodes)] = drawn_episodes
-    return episodes
+    episodes = np.empty((DRAWS, n), np.intp)
+    for start in (0, 1):
+        size = len(range(start, n, 2))
+        episodes[:, start::2] = 2 * rng.integers(max(size, 1), size=(DRAWS, size)) + start
+    return Drawn(episodes, rng.random((DRAWS, n)))
 
 
 class Standards(NamedTuple):
@@ -141,14 +115,11 @@ class Standards(NamedTuple):
         far = [s - centre for s in defined]
         largest = max(float(np.abs(x).max(initial=0.0)) for x in far)
         unit = math.ldexp(1.0, math.frexp(largest)[1] - 1) if largest else 1.0
-        sums = np.array(
-            [[x.size, (x / unit).sum(), ((x / unit) ** 2).sum()] for x in far] + [[0] * 3]
-        )
+        sums = np.array([[x.size, (x / unit).sum(), ((x / unit) ** 2).sum()] for x in far])
         size, first, second = sums[episodes].sum(axis=1).T
         size = np.where(size > 0, size, np.nan)
         variance = np.maximum(second / size - (first / size) ** 2, 0.0)
-        none = np.zeros(0)
-        ends = np.array([[s.min(initial=np.inf), s.max(initial=-np.inf)] for s in [*defined, none]])
+        ends = np.array([[s.min(initial=np.inf), s.max(initial=-np.inf)] for s in defined])
         low, high = ends[episodes, 0].min(axis=1), ends[episodes, 1].max(axis=1)
         equal = low == high
         mean = np.where(equal, low, centre + unit * (first / size))
@@ -263,23 +234,32 @@ class Recalibration:
         """
         n, numbers = len(scores), numbered(recordings, len(scores))
         count = len({*numbers.tolist()})
-        draws = drawn(environment, n, tuple(numbers.tolist()) if 1 < count < n else ())
-        standards = Standards.fit(scores, draws.episodes)
-        statistic = None
-        of_quantile, indices = draws, np.arange(n)
+        unit = numbers if count > 1 else np.arange(n)
+        draws = drawn(environment, int(unit.max(initial=-1)) + 1)
+        windows: list[list[Floats]] = [[] for _ in draws.episodes[0]]
+        for k, of_episode in zip(unit.tolist(), scores, strict=True):
+            windows[k].append(of_episode)
+        whole = [np.concatenate(of_unit) for of_unit in windows]
+        standards, statistic, indices = Standards.fit(whole, draws.episodes), None, np.arange(n)
         if alarm == "cusum":
-            standardizing, indices = draws.halves
-            statistic = Standards.fit([scores[i] for i in standardizing], draws.half(0).episodes)
-            of_quantile = draws.half(1)
+            standardizing, indices = halves(numbers)
+            first = int(unit[standardizing[:1]].sum()) % 2
+            statistic = Standards.fit(whole[first::2], draws.half(first).episodes)
+            draws, unit = draws.half(1 - first), unit // 2
         levels = offered_levels(n, alarm)
-        episodes, weights = [scores[i] for i in indices], window_weights(numbers[indices])
-        largest = _largest(episodes, statistic) if levels else np.zeros((DRAWS, 0))
-        drawn_thresholds = {}
-        for suffix, level in levels.items():
-            counts_windows = no_promise(n, count, level, alarm)
-            each = None if counts_windows else weights
-            drawn_thresholds[suffix] = thresholds(largest, of_quantile, level, each)
-        return cls(standards, statistic, drawn_thresholds)
+        largest = np.zeros((DRAWS, 0))
+        if levels:
+            largest = _largest([scores[i] for i in indices], statistic)
+            draws = draws.of_windows(unit[indices])
+        weights = {
+            suffix: None if no_promise(n, count, level, alarm) else window_weights(unit[indices])
+            for suffix, level in levels.items()
+        }
+        return cls(
+            standards,
+            statistic,
+            {s: thresholds(largest, draws, level, weights[s]) for s, level in levels.items()},
+        )
 
     def firsts(self, episodes: Sequence[Floats]) -> dict[str, Floats]:
         """Return rows of first guaranteed alarms by suffix, NaN without: (draws, episodes)."""

@@ -329,8 +329,8 @@ def contribution(record: Record, metric: str) -> Contribution:
     """Return a record's terms of a metric, and what its calibration episodes do to it."""
     terms, nominal = record.per_trajectory[metric], _nominal(record)
     deviations = record.calibration_draws.get(metric, _NONE)
-    recordings = _recordings(record)
-    return Contribution(terms[0], terms[1], _is_median(metric), nominal, deviations, recordings)
+    further = nominal, deviations, record.recordings_of_terms
+    return Contribution(terms[0], terms[1], _is_median(metric), *further)
 
 
 _NONE: Final = np.zeros(0)
@@ -339,11 +339,6 @@ _NONE: Final = np.zeros(0)
 def _nominal(record: Record) -> int | None:
     """Return with how many nominal test episodes terms begin; None where episodes have twins."""
     return None if record.paired else record.counts["nominal"]
-
-
-def _recordings(record: Record) -> tuple[int, ...]:
-    """Return the recordings that the episodes of terms are windows of; empty where each is one."""
-    return (*record.recordings.get("nominal", ()), *record.recordings.get("test", ()))
 
 
 def _is_median(metric: str) -> bool:
@@ -359,7 +354,7 @@ def _drawn_cells(records: Sequence[Record], metric: str) -> dict[tuple[int, ...]
             # Each condition without twins has a sample of its own.
             condition = "" if r.paired else str(r.condition)
             size = len(r.per_trajectory[metric][0])
-            key = r.environment, condition, _nominal(r), _recordings(r), size
+            key = r.environment, condition, _nominal(r), r.recordings_of_terms, size
             by_shape.setdefault(key, []).append(i)
     cells = {}
     for (environment, condition, episodes, recordings, _), indices in by_shape.items():

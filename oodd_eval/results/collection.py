@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
-from oodd_eval.data.parts import TWINS, AnomalousSet, EnvironmentData, LabelledSet
+from oodd_eval.data.parts import CALIBRATION, TWINS, AnomalousSet, EnvironmentData, LabelledSet
 from oodd_eval.data.split import Split
 from oodd_eval.errors import MissingExtraError, ResultsError, UsageError
 from oodd_eval.metrics.alarms import GuaranteedAlarm
@@ -22,7 +22,7 @@ from oodd_eval.prose import terminal_text
 from oodd_eval.results import plots
 from oodd_eval.results.board import Conditions, boards, level_of
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
-from oodd_eval.results.evaluate import ScoredEpisode, must_be_of, rules_of, stored_scores
+from oodd_eval.results.evaluate import Rules, ScoredEpisode, must_be_of, stored_scores
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import STATUSES, Record
 from oodd_eval.results.render import FORMATS
@@ -375,7 +375,9 @@ class Results(Sequence[Record]):
                 data: EnvironmentData = opened(split)(record.environment)
                 file = stored_scores([record], self._directory, data)
                 of_board = [r for r in self.records if Conditions.of(r) == Conditions.of(record)]
-                rules = rules_of(record, file.parts, data)
+                joining = file.parts[TWINS] if record.rolling else None
+                calibration, recordings = file.parts[CALIBRATION], record.recordings
+                rules = Rules.fit(calibration, record.alarm, joining, recordings)
                 level = level_of(of_board)
                 yield _scored(record, file, data, rules.guaranteed.get(level), level)
 

@@ -5,7 +5,7 @@ Cells without twins have metrics of their own, see `oodd_eval.metrics.unpaired`.
 
 import contextlib
 import math
-from collections.abc import Collection, Hashable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from types import MappingProxyType
@@ -56,17 +56,15 @@ class Rules:
         calibration: Sequence[Scores],
         alarm: AlarmKind = "cusum",
         joining: Sequence[Scores] | None = None,
-        recordings: Sequence[Hashable] | None = None,
+        recordings: Mapping[str, Sequence[int]] = MappingProxyType({}),
     ) -> "Rules":
         """Standardize and find thresholds on the scores of nominal trajectories.
 
         `joining` are those of nominal test episodes that join a rolling calibration, `recordings`
-        what the episodes of both are windows of.
+        those of a record.
         """
-        n = len(calibration)
-        levels = alarms.offered_levels(n, alarm)
-        numbers = recordings and alarms.numbered(recordings, n + len(joining or ())).tolist()
-        fitted = Calibration.fit(calibration, alarm, numbers and numbers[:n])
+        levels = alarms.offered_levels(len(calibration), alarm)
+        fitted = Calibration.fit(calibration, alarm, recordings.get(CALIBRATION))
         # A run goes on with a threshold that nothing exceeds, and counts what it misses.
         guaranteed = {
             suffix: replace(fitted.unbounded, threshold=fitted.threshold(level))
@@ -78,8 +76,8 @@ class Rules:
         earlier: dict[str, list[GuaranteedAlarm]] = {}
         for suffix, level in levels.items():
             with contextlib.suppress(UsageError):  # too few for this level
-                numbers_of_joining = numbers and numbers[n:]
-                earlier[suffix] = alarms.rolling_rules(fitted, joining, level, numbers_of_joining)
+                further = recordings.get("nominal")
+                earlier[suffix] = alarms.rolling_rules(fitted, joining, level, further)
         last = {suffix: rules.pop() for suffix, rules in earlier.items()}
         return cls(paper, last, fitted.unbounded, earlier)
 
@@ -194,7 +192,11 @@ def evaluated(
     before they differ, see `check_before_effect`.
     """
     try:
-        rules = rules_of(records[0], scores.parts, data)
+        joining = scores.parts[TWINS] if records[0].rolling else None
+        records = [replace(r, recordings=_recordings(r, scores.parts, data)) for r in records]
+        rules = Rules.fit(
+            scores.parts[CALIBRATION], records[0].alarm, joining, records[0].recordings
+        )
     except OverflowError:
         return _invalid(
             records, "scores are too large: their sum over the calibration trajectories overflows"
@@ -204,9 +206,6 @@ def evaluated(
         return _invalid(
             records, "no score of the calibration trajectories is defined, so there is no threshold"
         )
-    records = [
-        replace(r, recordings=_numbers_of_recordings(r, scores.parts, data)) for r in records
-    ]
     cells = [cell_scores(record, scores.parts, data) for record in records]
     draws = _calibration_draws(records[0], cells, scores, data)
     measured = [
@@ -226,38 +225,19 @@ def evaluated(
     return [replace(r, note=few) if r.rolling else r for r in measured]
 
 
-def rules_of(record: Record, parts: Mapping[str, Sequence[Scores]], data: EnvironmentData) -> Rules:
-    """Return the alarm rules of a unit.
-
-    Parameters
-    ----------
-    record
-        Of any of its cells.
-    parts
-        Its scores by part.
-    data
-        The environment.
-    """
-    calibration, twins = parts[CALIBRATION], parts[TWINS] if record.rolling else None
-    kept = {CALIBRATION: len(calibration), TWINS: len(twins or ())}
-    recordings = [r for part, n in kept.items() for r in (data.recordings(part) or ())[:n]]
-    return Rules.fit(calibration, record.alarm, twins, recordings or None)
-
-
-def _numbers_of_recordings(
+def _recordings(
     record: Record, parts: Mapping[str, Sequence[Scores]], data: EnvironmentData
 ) -> dict[str, tuple[int, ...]]:
-    """Return what the episodes of a cell are windows of; empty where each is a recording."""
-    names = {"calibration": CALIBRATION, "nominal": TWINS, "test": record.condition.part}
-    labels = {
-        name: (data.recordings(part) or ())[: len(parts[part])]
-        for name, part in names.items()
-        if part in parts and not (name == "test" and part == TWINS)
-    }
-    every = [label for of_part in labels.values() for label in of_part]
-    numbers = iter(alarms.numbered(every, len(every)).tolist())
+    """Return the recordings of a cell's episodes by part; empty where each episode is one."""
+    names = {CALIBRATION: CALIBRATION, "nominal": TWINS, "test": record.condition.part}
+    labels: dict[str, Sequence[str]] = {}
+    for name, part in names.items():
+        if part in parts and part not in map(names.get, labels):
+            labels[name] = (data.recordings(part) or ())[: len(parts[part])]
     if all(len({*of_part}) == len(of_part) for of_part in labels.values()):
         return {}
+    every = [label for of_part in labels.values() for label in of_part]
+    numbers = iter(alarms.numbered(every, len(every)).tolist())
     return {name: tuple(islice(numbers, len(of_part))) for name, of_part in labels.items()}
 
 
@@ -382,7 +362,7 @@ def _calibration_draws(
     # A rolling calibration is not resampled: its episodes have an order.
     if first.rolling:
         return [{} for _ in cells]
-    calibration, numbers = scores.parts[CALIBRATION], first.recordings.get("calibration")
+    calibration, numbers = scores.parts[CALIBRATION], first.recordings.get(CALIBRATION)
     again = Recalibration.fit(calibration, first.alarm, first.environment, numbers)
     return again.of_cells(cells, data.logs.rate if data.logs else None)
 
@@ -478,9 +458,8 @@ def cell_scores(
         anomalous, episodes = parts[record.condition.part], data.anomalous(record.condition)
         rows = (rows[: len(anomalous)].tolist() for rows in (episodes.onsets, episodes.effects))
         return PairedScores(anomalous, nominal, *rows)
-    recordings = (*record.recordings.get("nominal", ()), *record.recordings.get("test", ()))
     tasks = data.twins.tasks[: len(nominal)]
-    cell = UnpairedScores(nominal, [], [], tasks, [], facts.clock, recordings)
+    cell = UnpairedScores(nominal, [], [], tasks, [], facts.clock, record.recordings_of_terms)
     if record.condition == NOMINAL:
         return cell
     anomalous, labelled = parts[record.condition.part], data.labelled(record.condition)

@@ -318,6 +318,11 @@ class Record:
         return self.environment, str(self.condition)
 
     @property
+    def recordings_of_terms(self) -> tuple[int, ...]:
+        """Recordings of the episodes that terms are of; empty where each episode is one."""
+        return (*self.recordings.get("nominal", ()), *self.recordings.get("test", ()))
+
+    @property
     def identity(self) -> tuple[str, ...]:
         """Equal for two results of the same cell, of which the later replaces the earlier."""
         conditions = [self.protocol, self.parameters, self.limit]

@@ -174,13 +174,13 @@ class Tables:
         """Return what a table of guaranteed alarms promises, and which level stands for another."""
         names, asked = [column.metric for column in columns], self.level or catalogue.HEADLINE
         episodes = "nominal twins" if self.board.paired else "nominal test episodes"
-        unpromised_cells = [r for r in self.board.records if unpromised(r, self.suffix)]
-        promise = f"False episodes is the share of this split's {episodes} that raised an alarm."
-        if len(unpromised_cells) < len([r for r in self.board.records if r.ok]):
-            promise = (
-                f"The threshold promises an alarm in at most {percent_of(self.suffix)} of nominal "
-                f"episodes; false episodes is the share of this split's {episodes} that raised one."
-            )
+        is_kept = any(r.ok and not unpromised(r, self.suffix) for r in self.board.records)
+        promised = f"an alarm in at most {percent_of(self.suffix)} of nominal episodes"
+        promise = (
+            f"The threshold promises {promised if is_kept else 'nothing'}; "
+            f"false episodes is the share of this split's {episodes} that raised "
+            f"{'one' if is_kept else 'an alarm'}."
+        )
         lowered = lowered_level(self.board, asked, self.suffix)
         return _joined(
             promise * bool(names), *(lowered if f"false_episodes_{asked}" not in names else ())
@@ -537,38 +537,25 @@ def unpromised(record: Record, suffix: str) -> str:
         A phrase without a full stop, see `oodd_eval.metrics.alarms.no_promise`.
     """
     numbers = record.recordings.get("calibration", ())
-    if not record.ok or not numbers or f"false_episodes_{suffix}" not in record.metrics:
+    if f"false_episodes_{suffix}" not in record.metrics:
         return ""
-    level = catalogue.LEVELS[suffix]
-    counts = len(numbers), len({*numbers})
-    return no_promise(*counts, level, record.alarm, rolling=record.rolling)
-
-
-def promises_lacking(record: Record) -> list[str]:
-    """Return `unpromised` for each level of a record, the largest first."""
-    return [*filter(None, (unpromised(record, suffix) for suffix in catalogue.LEVELS))]
+    return no_promise(len(numbers), len({*numbers}), catalogue.LEVELS[suffix], record.alarm)
 
 
 def _unpromised(board: Board, column: Column) -> list[str]:
     """Return which promises a column of alarms lacks, a sentence for each reason."""
     suffix = f"at_{column.metric.rpartition('_at_')[2]}"
-    if suffix not in catalogue.LEVELS:
-        return []
-    concerned: dict[str, tuple[dict[str, None], dict[str, None]]] = {}  # places and rows by reason
+    shown = [e for e in board.environments if not column.environments or e in column.environments]
+    rows: dict[tuple[str, str], dict[str, None]] = {}
     for r in board.records:
-        is_shown = not column.environments or r.environment in column.environments
-        if is_shown and (text := unpromised(r, suffix)):
-            of_text = concerned.setdefault(text, ({}, {}))
-            of_text[0][r.environment] = of_text[1][str(r.setting)] = None
-    prefix = ""
-    sentences = []
-    for text, (places, rows) in concerned.items():
-        if len(concerned) > 1:
-            several = len(board.environments) > 1
-            names = [_listed(places, "environments")] * several + [_listed(rows, "rows")]
-            prefix = f"{', '.join(names)}: "
-        sentences.append(f"{UNPROMISED} {prefix}{text}.")
-    return sentences
+        text = unpromised(r, suffix) if r.environment in shown else ""
+        rows.setdefault((r.environment, text), {})[str(r.setting)] = None
+    several = len(rows) > 1
+    return [
+        UNPROMISED + f" {place}, {_listed(of_text, 'rows')}:" * several + f" {text}."
+        for (place, text), of_text in rows.items()
+        if text
+    ]
 
 
 def lowered_level(board: Board, asked: str, level: str) -> list[str]:
@@ -723,17 +710,7 @@ def _episodes(board: Board) -> list[str]:
         counts = {name: n for r in cells for name, n in r.counts.items()}
         tests = {str(r.condition): r.counts.get("test", 0) for r in cells if r.condition != NOMINAL}
         listed = [f"{n} {name}" for name, n in tests.items()]
-        several = {name: len({*n}) for r in cells for name, n in r.recordings.items()}
-        of_recordings = {
-            name: f" ({counted(n, 'recording(s)')})"
-            for name, n in several.items()
-            if n < counts.get(name, 0)
-        }
-        named = [
-            f"{counts[name]} {text}{of_recordings.get(name, '')}"
-            for name, text in _PARTS.items()
-            if name in counts
-        ]
+        named = [f"{counts[k]} {text}" for k, text in _PARTS.items() if k in counts]
         lines.append(f"Episodes of {environment}: {', '.join([*named, *listed])}.")
     return lines
 
@@ -786,5 +763,4 @@ def _left_out(record: Record, metric: str) -> str:
     episodes = record.counts.get("calibration")
     if episodes is None or suffix in offered_levels(episodes, record.alarm):
         return ""
-    recordings = len({*record.recordings.get("calibration", range(episodes))})
-    return _too_few(episodes, catalogue.LEVELS[suffix], record.alarm, recordings)
+    return _too_few(episodes, catalogue.LEVELS[suffix], record.alarm)

@@ -1,13 +1,12 @@
 """Guaranteed alarms: thresholds, what counts as found, and the promise itself, by simulation."""
 
 import math
+from types import SimpleNamespace
 from typing import get_args
 
 import numpy as np
 import pytest
 from helpers_records import make_record
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.stats import binom
 
 from oodd_eval.cli.main import main
@@ -15,6 +14,7 @@ from oodd_eval.data.parts import CALIBRATION
 from oodd_eval.metrics.alarms import (
     STATISTICS,
     AlarmKind,
+    Calibration,
     GuaranteedAlarm,
     Monitor,
     guaranteed_contributions,
@@ -114,15 +114,6 @@ def test_a_score_of_its_own_is_its_statistic_and_all_episodes_count():
     assert GuaranteedAlarm.fit(calibration, 0.20, "score").threshold == 8.0
 
 
-@given(st.lists(st.lists(st.integers(-3, 3), min_size=1, max_size=9), min_size=19, max_size=25))
-def test_several_levels_at_once_are_each_level_alone(values):
-    scores, levels = [np.array(v, float) for v in values], [0.2, 0.1, 0.05]
-    several = GuaranteedAlarm.fits(scores, levels, "score")
-    assert several == [GuaranteedAlarm.fit(scores, level, "score") for level in levels]
-    thresholds = [rule.threshold for rule in several]
-    assert thresholds == sorted(thresholds)
-
-
 # -- what is counted ------------------------------------------------------------------------------
 
 
@@ -195,7 +186,8 @@ def test_nulls_are_the_same_figures_of_the_twins_at_their_partners_effects():
 def test_a_cell_without_a_threshold_is_invalid(scores, alarm, reason):
     calibration = [np.full(9, scores) for _ in range(40)]
     record = make_record(alarm=alarm)
-    (found,) = evaluated([record], ScoreFile({CALIBRATION: calibration}, {}), None)
+    data = SimpleNamespace(recordings=lambda _part: None)
+    (found,) = evaluated([record], ScoreFile({CALIBRATION: calibration}, {}), data)
     assert found.status == "invalid"
     assert reason in found.reason
 
@@ -274,9 +266,9 @@ def test_a_nominal_episode_alarms_with_at_most_the_promised_probability(n, kind)
     assert levels
     false = dict.fromkeys(levels, 0)
     for problem in episodes:
-        rules = GuaranteedAlarm.fits(list(problem[:n]), list(levels.values()), kind)
-        for suffix, rule in zip(levels, rules, strict=True):
-            false[suffix] += rule.first(problem[n]) is not None
+        calibration = Calibration.fit(list(problem[:n]), kind)
+        for suffix, level in levels.items():
+            false[suffix] += calibration.rule(level).first(problem[n]) is not None
     for suffix, level in levels.items():
         # Three standard errors: 6 wrong failures in 10 000 runs of one test.
         error = 3 * math.sqrt(level * (1 - level) / problems)

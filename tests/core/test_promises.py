@@ -88,19 +88,26 @@ def test_equal_weights_give_the_rank_of_the_guarantee(monkeypatch):
     rng = np.random.default_rng(0)
     for n, level in itertools.product(range(9, 60), (0.01, 0.05, 0.10, 0.2)):
         largest = tuple(rng.normal(size=n))
-        known = Calibration("score", None, largest, n, rolling=True)
+        known = Calibration("score", None, largest, n, tuple(range(n)), n, rolling=True)
         rank = quantile_rank(n, level)
         expected = sorted(largest)[rank - 1] if rank <= n else math.inf
         assert known.threshold(level) == expected
+
+
+def rolling_calibration(n):
+    numbers = tuple(range(n))
+    return Calibration("score", None, numbers, n, numbers, n, rolling=True)
 
 
 def test_so_many_episodes_and_no_fewer_allow_a_rolling_threshold():
     for level in (0.2, 0.1, 0.06, 0.05):
         n = least_rolling(level)
         for size in (n - 1, n):
-            known = Calibration("score", None, tuple(range(size)), size, rolling=True)
+            known = Calibration(
+                "score", None, (*range(size),), size, (*range(size),), size, rolling=True
+            )
             assert math.isfinite(known.threshold(level)) == (size == n)
-    known = Calibration("score", None, tuple(range(5000)), 5000, rolling=True)
+    known = rolling_calibration(5000)
     with pytest.raises(UsageError, match="more than any number can promise"):
         known.rule(0.01)
 

@@ -52,7 +52,7 @@ EFFECTS = ONSETS + np.array([0, 1, 0, 2, 0, 0])
 
 def naive_rules(draw, kind):
     """Return the rules of one draw: the paper's, and guaranteed ones by suffix."""
-    chosen, spread = (x[draw] for x in drawn("arm", len(CALIBRATION))[:2])
+    chosen, spread = (x[draw] for x in drawn("arm", len(CALIBRATION)))
     again = [CALIBRATION[i] for i in chosen]
     paper = AlarmRule(Standardization.fit(again))
     standardization, judged, chosen_judged = None, CALIBRATION, chosen

@@ -24,7 +24,7 @@ from oodd_eval.metrics.auc import Contribution, mean_of
 from oodd_eval.metrics.bootstrap import drawn_cell, mean_interval, sums_of_recordings
 from oodd_eval.metrics.cusum import DRIFT, UNIT
 from oodd_eval.metrics.promise import EpisodeMeans, achieved_share, enough_episodes, promises
-from oodd_eval.metrics.recalibration import DRAWS, Recalibration, Standards, drawn
+from oodd_eval.metrics.recalibration import DRAWS, Recalibration, drawn
 from oodd_eval.results.board import boards
 from oodd_eval.results.report import Report, flat
 from oodd_eval.results.tables import UNPROMISED, Tables
@@ -92,7 +92,7 @@ def test_one_episode_a_recording_is_what_it_was(kind, confidence):
     if confidence is None:
         rules = rolling_rules(plain, more, 0.10)
         assert rolling_rules(fitted, more, 0.10, range(60, 64)) == rules
-        again = Recalibration.fit(scores, kind, "arm", range(60))
+        again = Recalibration.fit(scores, kind, "arm", [*range(60)])
         for suffix, values in Recalibration.fit(scores, kind, "arm").thresholds.items():
             assert np.array_equal(again.thresholds[suffix], values)
 
@@ -106,8 +106,7 @@ def test_too_few_recordings_count_windows_and_promise_nothing():
     assert "; 22 recordings would" in fitted.no_promise(0.10, 0.9)
     of_sum = Calibration.fit(scores, "cusum", ["a"] * 38)
     assert of_sum.no_promise(0.10) == words.replace("9 rec", "18 rec")
-    assert of_sum == Calibration("cusum", of_sum.standardization, of_sum.largest, 38, False,
-                                 (0,) * 19, 1)  # fmt: skip
+    assert (of_sum.recordings, of_sum.recording_count, of_sum.episodes) == ((0,) * 19, 1, 38)
     assert of_sum.threshold(0.10) == Calibration.fit(scores, "cusum").threshold(0.10)
     assert "0.5 % " not in no_promise(400, 30, 0.03, "score")
     with pytest.raises(UsageError, match="2 recordings of 38 episodes"):
@@ -133,10 +132,11 @@ def test_windows_of_the_recording_that_joins_share_its_weight():
     assert several.threshold(0.10) == one.threshold(0.10)
     assert several.joined(0.0).recordings[-1] == 13
     few = Calibration.fit([np.zeros(1)] * 40, "score", ["a"] * 20 + ["b"] * 20).joined(1.0)
-    assert (
-        few.no_promise(0.10)
-        == "41 windows of 3 recordings: no promise at 10 %; 12 recordings would"
-    )
+    words = "41 windows of 3 recordings: no promise at 10 %; 9 recordings would"
+    assert few.no_promise(0.10) == words
+    some = Calibration.fit([np.zeros(1)] * 40, "score", [i // 4 for i in range(40)])
+    with pytest.raises(UsageError, match="needs 12 episodes at 10 %, got 11"):
+        some.joined(1.0).rule(0.10)
 
 
 def test_import_says_how_many_recordings_a_level_takes():
@@ -171,20 +171,20 @@ def test_findings_compare_recordings_where_there_are_enough():
     assert "of the 100 later calibration episodes" in achieved_share(scores, "score").text
 
 
-def test_draws_are_of_recordings():
-    numbers = numbered([*"aabbbccdeeeef"], 13)
-    draws = drawn("arm", 13, tuple(numbers.tolist()))
-    for half, columns in zip(draws.halves, draws.columns, strict=True):
-        for row in draws.episodes[:, columns]:
-            counts = np.bincount(row, minlength=14)[:13]
-            of_half = {k: {*counts[numbers == k].tolist()} for k in {*numbers[half].tolist()}}
-            assert all(len(times) == 1 for times in of_half.values())
-            assert sum(times.pop() for times in of_half.values()) == len(of_half)
-            assert not counts[np.setdiff1d(np.arange(13), half)].any()
+def test_a_drawn_recording_brings_all_its_windows():
+    unit = numbered([*"aabbbccdeeeef"], 13)
+    draws = drawn("arm", 6)
+    windows = draws.of_windows(unit)
+    for of_units, spread, row, spreads in zip(*draws, *windows, strict=True):
+        expected = [np.flatnonzero(unit == k) for k in of_units]
+        flat = np.concatenate(expected)
+        assert row.tolist() == [*flat, *[13] * (len(row) - len(flat))]
+        assert np.array_equal(spreads[: len(flat)], np.repeat(spread, [*map(len, expected)]))
+    assert drawn("arm", 6).of_windows(np.arange(6)) is draws
     scores = [np.arange(k + 1.0) for k in range(13)]
-    standards = Standards.fit(scores, draws.episodes)
+    standards = Recalibration.fit(scores, "score", "arm", unit.tolist()).standards
     for i in range(DRAWS):
-        pooled = np.concatenate([scores[k] for k in draws.episodes[i] if k < 13])
+        pooled = np.concatenate([scores[k] for k in windows.episodes[i] if k < 13])
         assert standards.mean[i] == pytest.approx(pooled.mean())
         assert standards.std[i] == pytest.approx(pooled.std())
 
@@ -280,8 +280,8 @@ def test_figures_without_a_promise_are_marked_everywhere(tmp_path):
     assert f"missed{UNPROMISED}" in table.header
     assert "pooled AUC" in table.header
     assert f"{UNPROMISED} {words} 5 %; " in table.note
-    assert "The threshold promises" not in table.note
-    assert "40 calibration (1 recording)" in str(Report(records))
+    assert "The threshold promises nothing; " in table.note
+    assert f"{UNPROMISED} {words}" in " ".join(str(Report(records)).split())
     assert words in flat(records)[0]["promise"]
     assert flat(unmarked)[0]["promise"] == ""
     again = load_results(tmp_path / "out").records

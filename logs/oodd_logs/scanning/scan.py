@@ -395,8 +395,8 @@ def _scan_with(
     )
     terms = _Terms("a watchdog", fdr, notes, watchdog.rule.threshold)
     if (calibration := watchdog.calibration) is not None:
-        reference = _Reference.of(np.array(calibration.largest), np.array(calibration.numbers))
-        windows = reference.count > len({*calibration.numbers})
+        reference = _Reference.of(np.array(calibration.largest), np.array(calibration.recordings))
+        windows = reference.count > len({*calibration.recordings})
         enough = (reference.count + 1) * fdr >= len(episodes) and not windows
         terms = replace(terms, reference=reference, exact=enough and not calibration.rolling)
     return _verdict(judged, watchdog.sensors, terms)
