@@ -32,7 +32,8 @@ def parameter(
     """Declare one parameter in a frozen dataclass of parameters.
 
     Values are at least `low`, more than `above`, at most `high`, and among the `choices`, where
-    there are any. In a ``list[float]`` that holds for each value, and there has to be one.
+    there are any; where all choices are texts, numbers are bounded alone. In a ``list[float]`` that
+    holds for each value, and there has to be one.
 
     `decides` is ``"fit"`` for what changes the fitted detector, ``"scores"`` for what changes the
     scores of the same fit, so that fits are shared over its values, and ``"nothing"`` for what
@@ -81,9 +82,12 @@ class ParameterInfo:
         plain = type(value) in expected or (float in expected and type(value) is int)
         if not plain and object not in expected:
             return f"expected {' or '.join(_TYPE_NAMES.get(t, t.__name__) for t in expected)}"
-        if self.choices and value not in self.choices:
-            return f"expected one of {', '.join(map(repr, self.choices))}"
-        if value is None:
+        named = isinstance(value, str) or not all(isinstance(c, str) for c in self.choices)
+        if self.choices and named and value not in self.choices:
+            others = [_TYPE_NAMES[kind] for kind in (int, float) if kind in expected]
+            texts = ", ".join(map(repr, self.choices))
+            return f"expected one of {' or '.join([texts, *others])}"
+        if value is None or isinstance(value, str):
             return ""
         # Written so that NaN is refused, too.
         if self.low is not None and not value >= self.low:

@@ -24,14 +24,17 @@ from oodd_panel.forecast import (
     chosen_ridge,
     regressors,
 )
+from oodd_panel.learning import FAULTS, ONSET, shows_no_loss, with_fault
 from oodd_panel.members import (
     ENERGY,
     LEAST_ENERGY,
     MEMBERS,
+    RECENT,
     Energy,
     Latest,
     NeighbourDistance,
     Pattern,
+    RecentRows,
     Sums,
 )
 from oodd_panel.surprise import SurpriseScale
@@ -242,20 +245,16 @@ def test_noise_is_told_from_heavy_tails_by_its_kurtosis():
 
 def test_features_are_the_same_for_one_row_at_a_time_as_for_many():
     rng = np.random.default_rng(4)
-    rows, levels, errors = (
-        rng.normal(size=(40, 7)),
-        rng.normal(size=(40, 3)),
-        rng.normal(size=(40, 3)),
-    )
-    batch, latest = Latest(3, 4)(rows, levels, errors), Latest(3, 4)
-    steps = [latest(rows[t : t + 1], levels[t : t + 1], errors[t : t + 1]) for t in range(40)]
+    rows, errors = rng.normal(size=(40, 7)), rng.normal(size=(40, 3))
+    batch, latest = Latest(3, 4, rows[0])(rows, errors), Latest(3, 4, rows[0])
+    steps = [latest(rows[t : t + 1], errors[t : t + 1]) for t in range(40)]
     for whole, *parts in zip(batch, *steps, strict=True):
         np.testing.assert_array_equal(whole, np.concatenate(parts))
 
 
 def test_energy_is_the_logarithm_of_the_mean_square_of_the_latest_errors():
     errors = np.arange(1.0, 13.0)[:, None]
-    energy = Latest(1, 2)(errors, errors, errors).energy[:, 0]
+    energy = Latest(1, 2, errors[0])(errors, errors).energy[:, 0]
     # Errors before the beginning count as 1.
     assert energy[0] == pytest.approx(np.log((1 + 9) / 10 + LEAST_ENERGY))
     assert energy[1] == pytest.approx(np.log((1 + 4 + 8) / 10 + LEAST_ENERGY))
@@ -263,8 +262,10 @@ def test_energy_is_the_logarithm_of_the_mean_square_of_the_latest_errors():
     assert len(errors[2:]) == ENERGY
 
 
-@pytest.mark.parametrize("member", [Sums(), Energy()], ids=["sums", "energy"])
-def test_contributions_to_a_mahalanobis_length_add_up_to_its_square(member):
+@pytest.mark.parametrize(
+    "member", [Sums(), Energy(), RecentRows()], ids=["sums", "energy", "recent"]
+)
+def test_contributions_to_a_length_add_up_to_its_square(member):
     rng = np.random.default_rng(5)
     member.fit(rng.normal(size=(200, 4)) @ rng.normal(size=(4, 4)))
     lengths, parts = member.differences(rng.normal(size=(9, 4)))
@@ -284,6 +285,35 @@ def test_a_pattern_is_what_principal_components_leave(rows):
     np.testing.assert_allclose(member.lengths(seen), np.linalg.norm(left, axis=1), rtol=1e-6)
     assert pca.explained_variance_ratio_.sum() >= 0.9
     assert pca.explained_variance_ratio_[:-1].sum() < 0.9
+
+
+@pytest.mark.parametrize("rows", [400, 60], ids=["many rows", "fewer rows than features"])
+def test_recent_rows_are_judged_by_t_squared_and_q_of_the_other_half(rows):
+    rng = np.random.default_rng(16)
+    mixing = rng.normal(size=(3, 80))
+    nominal = rng.normal(size=(rows, 3)) @ mixing + 0.1 * rng.normal(size=(rows, 80))
+    seen, member = 2 * rng.normal(size=(5, 80)), RecentRows()
+    member.fit(nominal)
+
+    def both(fitted, judged):
+        scores = fitted.transform(judged)
+        left = judged - fitted.inverse_transform(scores)
+        variances = fitted.explained_variance_ * (1 - 1 / fitted.n_samples_)
+        return np.stack([(scores**2 / variances).sum(axis=1), (left**2).sum(axis=1)])
+
+    halves = np.array_split(nominal, 2)
+    pcas = [PCA(RECENT, svd_solver="full").fit(half) for half in halves]
+    limits = np.quantile(
+        np.concatenate([both(pcas[1], halves[0]), both(pcas[0], halves[1])], axis=1), 0.99, axis=1
+    )
+    expected = both(PCA(RECENT, svd_solver="full").fit(nominal), seen) / limits[:, None]
+    np.testing.assert_allclose(member.lengths(seen), np.sqrt(expected.sum(axis=0)), rtol=1e-6)
+
+
+def test_recent_rows_of_no_variance_are_judged():
+    member = RecentRows()
+    member.fit(np.ones((30, 4)))
+    np.testing.assert_allclose(member.lengths(np.array([[1.0, 1, 1, 1], [3, 1, 1, 1]])), [0, 2])
 
 
 def test_neighbours_are_those_of_a_brute_search():
@@ -439,8 +469,8 @@ def test_members_are_surprised_by_what_they_look_at(panel):
     judged = panel._judged(Trajectory(rows))
     typical = np.median(panel._surprises(judged)[170:], axis=0)
     surprise = dict(zip([member.name for member in MEMBERS], typical, strict=True))
-    # Errors of alternating sign cancel in sums and in means, and not in squares.
-    assert surprise["energy"] > 1.5 * max(surprise["sums"], surprise["level"])
+    # Errors of alternating sign cancel in sums, and not in squares.
+    assert surprise["energy"] > 1.5 * surprise["sums"]
 
 
 def test_a_level_of_the_day_is_taken_out_with_baseline_rows():
@@ -463,6 +493,64 @@ def test_what_differs_between_episodes_is_learnt_from_their_first_rows():
     threshold = max(np.nanmax(panel.score(x)) for x in calibration)
     faulty = [driven(200 + seed, gain, onset=120) for seed, gain in enumerate(gains)]
     assert np.mean([np.nanmax(panel.score(x)[120:]) > threshold for x in faulty]) > 0.9
+
+
+def settled(seed, by=0.0):
+    """Two sensors about a level; from row 20 on one of them is off."""
+    rng = np.random.default_rng([seed, 5])
+    rows = rng.normal(size=(160, 2))
+    rows[20:, 0] += by
+    return Trajectory(rows)
+
+
+def test_identical_episodes_are_not_learnt_so_an_early_fault_is_found():
+    nominal = [settled(seed) for seed in range(20)]
+    faulty = [settled(200 + seed, by=1.5) for seed in range(10)]
+    panel, learning = (make_panel(learn=learn).fit(nominal) for learn in ("auto", 60))
+    assert not panel.forecast_.prior.size
+    assert learning.forecast_.prior.size
+    np.testing.assert_array_equal(
+        panel.score(faulty[0]), make_panel(learn="none").fit(nominal).score(faulty[0])
+    )
+    late = [[p.score(x)[100:].mean() for x in faulty] for p in (panel, learning)]
+    assert np.mean(late[0]) > np.mean(late[1])
+
+
+@pytest.mark.parametrize(
+    ("learn", "baseline", "rows"),
+    [("none", 0, 0), ("none", 40, 0), ("baseline", 0, 0), ("baseline", 40, 39), (25, 0, 24),
+     (25, 40, 24), (0, 40, 0), ("auto", 0, 59), ("auto", 40, 39)],
+)  # fmt: skip
+def test_as_many_rows_of_an_episode_are_learnt_as_asked_for(learn, baseline, rows):
+    gains = np.random.default_rng(11).uniform(0.5, 1.5, size=12)
+    nominal = [driven(seed, gain) for seed, gain in enumerate(gains)]
+    panel = make_panel("panel-a", forecast="linear", learn=learn, baseline=baseline).fit(nominal)
+    assert panel.learnt == rows
+    assert bool(panel.forecast_.prior.size) == bool(rows)
+    x = driven(300, 0.6)
+    learner = EpisodeLearner(panel.forecast_, panel.learnt)
+    episode = panel.standardized(x)
+    learner(regressors(episode, 1)[:rows], episode.rows[1 : 1 + rows])
+    before = learner.coefficients
+    learner(regressors(episode, 1)[rows:], episode.rows[1 + rows :])
+    assert learner.coefficients is before
+    assert np.array_equal(before, panel.forecast_.coefficients) == (rows == 0)
+
+
+def test_faults_are_put_into_a_fifth_of_the_sensors_from_row_15_on():
+    rows, generator = np.random.default_rng(3).normal(size=(60, 10)), np.random.default_rng(0)
+    for fault in FAULTS:
+        spoilt = with_fault(rows, np.ones(10), fault, generator)
+        np.testing.assert_array_equal(spoilt[:ONSET], rows[:ONSET])
+        changed = (spoilt[ONSET:] != rows[ONSET:]).any(axis=0).sum()
+        assert changed == (10 if fault[0] == "slow" else 2)
+
+
+def test_learning_must_gain_more_than_the_standard_error():
+    without = np.linspace(0.5, 0.7, 16)
+    assert shows_no_loss(without + 0.01, without)
+    assert not shows_no_loss(without - 0.01, without)
+    assert not shows_no_loss(without + np.tile([0.3, -0.29], 8), without)
 
 
 def pumped(seed, gain, onset=None):

@@ -22,6 +22,13 @@ class PanelParameters:
         choices=("auto", "linear", "ensemble"),
         help="auto: an ensemble of networks judges, too, from 20 episodes and 2500 rows on",
     )
+    learn: str | int = parameter(
+        "auto",
+        choices=("auto", "none", "baseline"),
+        low=0,
+        high=10_000,
+        help="first rows from which an episode is learnt; auto: where no early fault is lost by it",
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,8 @@ beside them; where sensors are noisy, charts of a forecast that knows the consta
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, ClassVar, Final
 
 import numpy as np
@@ -21,7 +22,7 @@ from oodd_eval.data.baseline import Baseline, Shift
 from oodd_eval.errors import TrajectoryError
 from oodd_eval.plugins.forecasting import CONSTANT, FeatureScale
 from oodd_eval.plugins.state import Arrays, State, take
-from oodd_panel import PanelParameters
+from oodd_panel import PanelParameters, learning
 from oodd_panel.constants import FOLDS, LAGS, ConstantsVoice
 from oodd_panel.forecast import (
     ORDER,
@@ -42,13 +43,11 @@ LIMIT: Final = 30.0
 DIMENSIONS: Final = 64
 """Sensors beyond which forecasts are of so many principal components."""
 LEARNT: Final = 60
-"""Rows from which an episode's coefficients are learnt, where fewer are declared nominal."""
+"""Rows from which an episode's coefficients are learnt, where none are declared nominal."""
 VARYING: Final = 10
 """Least episodes from which is learnt how episodes differ."""
 WIDEST: Final = 150
 """Most regressors with coefficients of each episode: their covariance takes the square of it."""
-GAIN: Final = 0.5
-"""Most that learning may leave of the variance between episodes' mean errors, to be of use."""
 SAMPLE: Final = 10_000
 """Most rows from which a member learns."""
 REFERENCE: Final = 4.6
@@ -203,7 +202,11 @@ class PanelDetector(LongFitDetector):
     @property
     def learnt(self) -> int:
         """Number of errors from which an episode is learnt; later ones are only judged."""
-        return max(LEARNT, self.baseline)
+        learn = self.parameters.learn
+        if learn == "auto":
+            learn = self.baseline or LEARNT
+        rows = learn if isinstance(learn, int) else self.baseline * (learn == "baseline")
+        return max(rows - self.horizon, 0)
 
     def _standard(self, rows: NDArray[np.float32]) -> Floats:
         scale = self.observation_scale_
@@ -257,16 +260,16 @@ class PanelDetector(LongFitDetector):
         learner = EpisodeLearner(forecast, self.learnt)
         levels = episode.rows[h:]
         errors = learner(regressors(episode, h), levels)
-        return Latest(levels.shape[1], window_of(rows.shape[1]))(rows[h:], levels, errors)
+        return Latest(levels.shape[1], window_of(rows.shape[1]), rows[0])(rows[h:], errors)
 
     def _judge(self, window: NDArray[Any], now: NDArray[Any], _t: int) -> float:
         level = self._levels(now[None])
         if self._latest is None or self._learner is None:
-            self._latest = Latest(level.shape[1], window_of(len(now)))
+            self._latest = Latest(level.shape[1], window_of(len(now)), window[-1])
             self._learner = EpisodeLearner(self.forecast_, self.learnt)
         self._live = window, level
         errors = self._learner(self._regressors(ORDER), level)
-        features = self._latest(now[None], level, errors)
+        features = self._latest(now[None], errors)
         surprises = self._surprises(features)
         said = [float(self.scales_[MEMBERS_VOICE](_combined(surprises))[0])]
         for name, voice in self.voices_.items():
@@ -368,15 +371,13 @@ class PanelDetector(LongFitDetector):
         folds = _folds(list(zip(rows, episodes, strict=True)), self.horizon)
         plain = [[episode for _, episode in fold] for fold in folds]
         ridge = chosen_ridge(plain, self.horizon)
-        varies = self.varies_ = self._varies(plain, ridge)
+        varies = self.varies_ = self._varies(list(zip(rows, episodes, strict=True)), ridge)
         lengths: list[Floats] = []
         for i, fold in enumerate(folds):
             others = [x for j, other in enumerate(folds) if j != i for x in other] or fold
             forecast, members = self._fitted(others, ridge, varies=varies)
             for fold_rows, episode in fold:
-                features = self._steps(fold_rows, episode, forecast)
-                seen = [member.lengths(member.features(features)) for member in members]
-                lengths.append(np.stack(seen, axis=1))
+                lengths.append(self._lengths(forecast, members, fold_rows, episode))
         for tail, values in zip(self.tails_, np.concatenate(lengths).T, strict=True):
             tail.fit(values)
         # A tenth of few rows, which resemble one another, say little about a tail.
@@ -418,28 +419,55 @@ class PanelDetector(LongFitDetector):
             members.append(member)
         return forecast, members
 
-    def _varies(self, folds: Sequence[Sequence[StandardEpisode]], ridge: float) -> bool:
-        """Tell whether learning an episode's coefficients brings its later errors together."""
-        episodes = [x for fold in folds for x in fold]
-        learnt = self.learnt
-        long = [x for x in episodes if len(x.rows) >= 2 * learnt + self.horizon]
-        width = ORDER * (self._dimensions + episodes[0].actions.shape[1]) + 1
-        if len(long) < VARYING or len(long) < len(episodes) / 2 or width > WIDEST:
+    def _varies(self, episodes: Sequence[tuple[Floats, StandardEpisode]], ridge: float) -> bool:
+        """Tell whether the coefficients of an episode are learnt from its first rows."""
+        width = ORDER * (self._dimensions + episodes[0][1].actions.shape[1]) + 1
+        if not self.learnt or len(episodes) < VARYING or width > WIDEST:
             return False
-        left = []
-        for varies in (False, True):
-            means = []
-            for part in (0, 1):
-                forecast = LinearForecast.fit(
-                    long[1 - part :: 2], self.horizon, ridge, varies=varies
-                )
-                for x in long[part::2]:
-                    errors = EpisodeLearner(forecast, learnt)(
-                        regressors(x, self.horizon), x.rows[self.horizon :]
-                    )
-                    means.append(np.clip(errors[learnt:], -LIMIT, LIMIT).mean(axis=0))
-            left.append(float(np.var(means, axis=0).mean()))
-        return left[1] <= GAIN * left[0]
+        if self.parameters.learn != "auto":
+            return True
+        long = [x for x in episodes if len(x[0]) >= 2 * self.learnt + self.horizon]
+        if len(long) < VARYING or len(long) < len(episodes) / 2:
+            return False
+        plain = [episode for _, episode in long]
+        if learning.gain(plain, self.horizon, ridge, self.learnt) < learning.LEAST_GAIN:
+            return False
+        if self.baseline:
+            return True
+        found = [self._early_faults_found(long, ridge, varies=varies) for varies in (True, False)]
+        return learning.shows_no_loss(*found)
+
+    def _early_faults_found(
+        self, episodes: Sequence[tuple[Floats, StandardEpisode]], ridge: float, *, varies: bool
+    ) -> Floats:
+        """Return how well faults in the rows that would be learnt from are found, by episode."""
+        parts = []
+        for part in (0, 1):
+            forecast, members = self._fitted(episodes[1 - part :: 2], ridge, varies=varies)
+            left = episodes[part::2][: learning.EPISODES // 2]
+            left = [(rows[: 2 * self.learnt], episode) for rows, episode in left]
+            judged = partial(self._lengths, forecast, members)
+            of_nominal = np.concatenate([judged(*x) for x in left])
+            tails = [SurpriseScale() for _ in members]
+            for tail, values in zip(tails, of_nominal.T, strict=True):
+                tail.fit(values)
+            scale = forecast.scale
+            if self.basis_.size:
+                scale = np.full(left[0][0].shape[1], float(scale.mean()))
+            parts.append((left, partial(_statistic, judged, tails), scale))
+        return learning.found(parts, self.horizon)
+
+    def _lengths(
+        self,
+        forecast: LinearForecast,
+        members: Sequence[PanelMember],
+        rows: Floats,
+        episode: StandardEpisode,
+    ) -> Floats:
+        """Return the members' lengths, (N, K), of the first rows of an episode."""
+        first = StandardEpisode(self._levels(rows), episode.actions[: len(rows) - 1])
+        features = self._steps(rows, first, forecast)
+        return np.stack([member.lengths(member.features(features)) for member in members], axis=1)
 
     # State.
 
@@ -464,6 +492,7 @@ class PanelDetector(LongFitDetector):
             "horizon": self.horizon,
             "baseline": self.baseline,
             "roles": [*self.roles],
+            "learn": self.parameters.learn,
         }
 
     def _arrays(self) -> Arrays:
@@ -517,6 +546,18 @@ class PanelDetector(LongFitDetector):
 def _part(state: State, prefix: str) -> dict[str, Any]:
     """Return what a prefix marks in a state, without it."""
     return {n.removeprefix(prefix): a for n, a in state.items() if n.startswith(prefix)}
+
+
+def _statistic(
+    judged: Callable[[Floats, StandardEpisode], Floats],
+    tails: Sequence[SurpriseScale],
+    rows: Floats,
+    episode: StandardEpisode,
+) -> Floats:
+    """Return the members' joint surprise of rows, (N,)."""
+    lengths = judged(rows, episode)
+    surprises = [tail(x) for tail, x in zip(tails, lengths.T, strict=True)]
+    return _combined(np.stack(surprises, axis=1))
 
 
 def _combined(surprises: Floats) -> Floats:

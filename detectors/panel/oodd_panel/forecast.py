@@ -180,7 +180,7 @@ class EpisodeLearner:
 
     def __init__(self, forecast: LinearForecast, rows: int) -> None:
         self._forecast = forecast
-        self._coefficients, self._covariance = forecast.coefficients, forecast.prior
+        self.coefficients, self._covariance = forecast.coefficients, forecast.prior
         self._left = rows if len(forecast.prior) else 0
 
     def __call__(self, regressed: Floats, observed: Floats) -> Floats:
@@ -194,7 +194,7 @@ class EpisodeLearner:
             errors[t] = self._step(regressed[t], observed[t])
         self._left -= first
         x = regressed[first:]
-        error = observed[first:] - product(x, self._coefficients, ROWS)
+        error = observed[first:] - product(x, self.coefficients, ROWS)
         variance = 1.0
         if len(self._covariance):
             spread = product(x, self._covariance, ROWS) * x
@@ -206,8 +206,8 @@ class EpisodeLearner:
         spread = self._covariance @ x
         variance = 1.0 + float(x @ spread)
         scale = self._forecast.scale * np.sqrt(variance)
-        error: Floats = (observed - x @ self._coefficients) / scale
+        error: Floats = (observed - x @ self.coefficients) / scale
         gain = spread / variance
-        self._coefficients = self._coefficients + np.outer(gain, limited(error, SURPRISE) * scale)
+        self.coefficients = self.coefficients + np.outer(gain, limited(error, SURPRISE) * scale)
         self._covariance = self._covariance - np.outer(gain, spread)
         return error

@@ -2,7 +2,7 @@
 
 Each is the length of some features, less a centre, times a matrix. They see different things: a
 pattern of sensors that was never seen, forecast errors of one sign, a combination of errors that
-was never seen, errors that grow, and a level that is off.
+was never seen, errors that grow, and latest rows that are far from nominal ones.
 """
 
 from __future__ import annotations
@@ -20,8 +20,6 @@ WINDOW: Final = (5, 20)
 """Fewest and most of the latest rows in which a pattern is looked for."""
 READINGS: Final = 1280
 """Readings of which a pattern is made, where there are neither too few rows nor too many."""
-LEVEL: Final = 5
-"""Latest rows whose mean is the level."""
 WEIGHTS: Final = (0.3, 0.1, 0.04)
 """Weights of the newest error in the sums. The smallest lets a sum fall back within 60 rows."""
 CLIP: Final = 6.0
@@ -34,6 +32,14 @@ LEAST_ENERGY: Final = 1e-2
 """Added to a mean squared error before its logarithm is taken."""
 VARIANCE: Final = 0.9
 """Share of the variance that the components of a pattern explain."""
+RECENT: Final = 0.95
+"""Share of the variance within which the latest rows are as far as nominal ones."""
+RECENT_COMPONENTS: Final = 64
+"""Most components for that: a live row is multiplied by all of them."""
+USUAL: Final = 0.99
+"""Quantile of nominal rows in whose units distances within and off the components are added."""
+LEAST_VARIANCE: Final = 1e-9
+"""Components with a smaller share of the largest one's variance are rounding."""
 NEIGHBOURS: Final = 5
 """Nearest nominal rows whose distances are averaged."""
 BANK: Final = 2000
@@ -44,6 +50,8 @@ SHRINKAGE: Final = 0.02
 """Least share of the identity in a correlation matrix."""
 PATTERNS: Final = 1000
 """Most windows from which the components of many sensors are computed."""
+RECENT_PATTERNS: Final = 500
+"""Most of them where components are computed three times."""
 CHUNK: Final = 4096
 """Rows whose features are looked at together: bounds memory."""
 
@@ -55,8 +63,6 @@ class Features(NamedTuple):
     ----------
     window
         The latest `window_of` rows of all sensors, newest first, (N, W * S).
-    level
-        Mean of as many rows, (N, D).
     sums
         Exponentially weighted errors on the scale of one error, (N, WEIGHTS, D).
     energy
@@ -64,7 +70,6 @@ class Features(NamedTuple):
     """
 
     window: Floats
-    level: Floats
     sums: Floats
     energy: Floats
 
@@ -83,44 +88,38 @@ class Latest:
         Number of errors of a row, D.
     window
         Rows that make a pattern, W.
+    first
+        The standardized first row of the episode, (S,). It stands for those before it.
     """
 
-    def __init__(self, dimensions: int, window: int) -> None:
+    def __init__(self, dimensions: int, window: int, first: Floats) -> None:
         self._window = window
         self._smoother = Smoother(WEIGHTS, dimensions)
-        self._rows: Floats | None = None  # newest first
-        self._levels: Floats
+        self._rows = np.repeat(first[None], window - 1, axis=0)  # newest first
         # What an error before the beginning would have been on average.
         self._squares = np.ones((ENERGY - 1, dimensions))
 
-    def __call__(self, rows: Floats, levels: Floats, errors: Floats) -> Features:
-        """Return the features of the next N rows.
-
-        From standardized rows (N, S), their components (N, D) and errors (N, D). At the beginning
-        of an episode the first row stands for those before it.
-        """
+    def __call__(self, rows: Floats, errors: Floats) -> Features:
+        """Return features of the next N rows, from standardized ones (N, S) and errors (N, D)."""
         n = len(rows)
-        if self._rows is None:
-            self._rows = np.repeat(rows[:1], self._window - 1, axis=0)
-            self._levels = np.repeat(levels[:1], LEVEL - 1, axis=0)
         every = np.concatenate([rows[::-1], self._rows])
         # Windows overlap in memory: copies would take twenty times as much of it.
         row = every.itemsize * every.shape[1]
         shape, strides = (n, self._window * every.shape[1]), (-row, every.itemsize)
         window: Floats = np.ndarray(shape, every.dtype, every, max(n - 1, 0) * row, strides)
-        all_levels = np.concatenate([self._levels, levels])
         squares = np.concatenate([self._squares, np.minimum(errors**2, LARGEST)])
-        level, energy = _sums(all_levels, LEVEL) / LEVEL, _sums(squares, ENERGY) / ENERGY
-        self._rows, self._levels = every[: self._window - 1], all_levels[n:]
-        self._squares = squares[n:]
+        energy = _sums(squares, ENERGY) / ENERGY
+        self._rows, self._squares = every[: self._window - 1], squares[n:]
         sums = self._smoother(limited(errors, CLIP)).swapaxes(0, 1)
-        return Features(window, level, sums, np.log(energy + LEAST_ENERGY))
+        return Features(window, sums, np.log(energy + LEAST_ENERGY))
 
 
 def _sums(rows: Floats, count: int) -> Floats:
     """Return the sum of each row (N + count - 1, D) and those before it, oldest first: (N, D)."""
     shape, strides = (count, len(rows) - count + 1, rows.shape[1]), (rows.strides[0], *rows.strides)
     lags: Floats = np.ndarray(shape, rows.dtype, rows, 0, strides)
+    if lags[0].size == 1:  # numpy adds a single column in pairs, many of them one after the other
+        return np.asarray(np.add.accumulate(lags, axis=0)[-1], np.float64)
     return np.asarray(np.add.reduce(lags, axis=0), np.float64)
 
 
@@ -233,17 +232,6 @@ class Energy(_Mahalanobis):
         return features.energy
 
 
-class Level(_Mahalanobis):
-    """Hotelling's T² of the mean of the latest rows."""
-
-    name = "level"
-    memory = float(LEVEL)
-
-    def features(self, features: Features) -> Floats:
-        """Return the features that it looks at, (N, F)."""
-        return features.level
-
-
 class Pattern(PanelMember):
     """Residual of the principal components of the latest rows (Q of Jackson & Mudholkar 1979)."""
 
@@ -292,6 +280,99 @@ class Pattern(PanelMember):
         """Take over a fit."""
         self.centre_ = take(arrays, "centre", (None,))
         self._prepare(take(arrays, "components", (len(self.centre_), None)))
+
+
+class RecentRows(PanelMember):
+    """Principal components of the latest rows: Hotelling's T² and Q together.
+
+    Each counts in units of a quantile of rows that the components were not computed from, of the
+    other half (MacGregor & Kourti 1995).
+    """
+
+    name = "recent"
+
+    def features(self, features: Features) -> Floats:
+        """Return the features that it looks at, (N, F)."""
+        return features.window
+
+    def fit(self, features: Floats) -> None:
+        """Learn from features of nominal rows, (N, F)."""
+        few = features
+        if few.shape[1] > RECENT_PATTERNS:
+            few = few[:: -(-len(few) // RECENT_PATTERNS)]
+        halves = np.array_split(few, 2) if len(few) > 1 else [few, few]
+        unseen = [
+            _t_squared_and_q(half - other.mean(axis=0), *_components(other))
+            for half, other in (halves, halves[::-1])
+        ]
+        limits = np.quantile(np.concatenate(unseen, axis=1), USUAL, axis=1)
+        within, off = np.where(limits < LEAST_VARIANCE, 1.0, limits).tolist()
+        components, variances = _components(few)
+        self.centre_ = few.mean(axis=0)
+        # What components weigh beside the whole length, of which Q is what they leave.
+        self.weights_ = 1.0 / (within * variances) - 1.0 / off
+        self.unit_ = 1.0 / off
+        self._prepare(components)
+
+    def _prepare(self, components: Floats) -> None:
+        self.components_ = np.ascontiguousarray(components)
+        self._back = np.ascontiguousarray(components.T)
+
+    def _lengths(self, features: Floats) -> Floats:
+        # In rows, however windows overlap: the bits of a sum depend on it.
+        centred: Floats = np.subtract(features, self.centre_, order="C")
+        scores = product(centred, self.components_, ROWS)
+        centred *= centred
+        scores *= scores
+        scores *= self.weights_
+        squares = self.unit_ * np.add.reduce(centred, axis=1) + np.add.reduce(scores, axis=1)
+        return np.sqrt(np.maximum(squares, 0.0))
+
+    def differences(self, features: Floats) -> tuple[Floats, Floats]:
+        """Return lengths (N,), and what each feature contributes to their squares, (N, F)."""
+        centred = features - self.centre_
+        scores = product(centred, self.components_, ROWS)
+        weighted = product(scores * self.weights_, self._back, ROWS)
+        return self._lengths(features), centred * (self.unit_ * centred + weighted)
+
+    def arrays(self) -> Arrays:
+        """Return what `restore` takes."""
+        return {
+            "centre": self.centre_,
+            "components": self.components_,
+            "weights": self.weights_,
+            "unit": np.array(self.unit_),
+        }
+
+    def restore(self, arrays: Arrays) -> None:
+        """Take over a fit."""
+        self.centre_ = take(arrays, "centre", (None,))
+        self._prepare(take(arrays, "components", (len(self.centre_), None)))
+        self.weights_ = take(arrays, "weights", (self.components_.shape[1],))
+        self.unit_ = float(take(arrays, "unit", (), "+"))
+
+
+def _components(features: Floats) -> tuple[Floats, Floats]:
+    """Return principal components (F, C) of `RECENT` of the variance, and their variances (C,)."""
+    centred = features - features.mean(axis=0)
+    n, f = centred.shape
+    values, vectors = np.linalg.eigh(centred @ centred.T if n < f else centred.T @ centred)
+    values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
+    if not values[0]:
+        return np.empty((f, 0)), np.empty(0)
+    kept = int(np.searchsorted(np.cumsum(values), RECENT * values.sum())) + 1
+    kept = min(kept, RECENT_COMPONENTS, int((values > LEAST_VARIANCE * values[0]).sum()))
+    values, components = values[:kept], vectors[:, :kept]
+    if n < f:
+        components = centred.T @ components / np.sqrt(values)
+    return components, values / n
+
+
+def _t_squared_and_q(centred: Floats, components: Floats, variances: Floats) -> Floats:
+    """Return the squared lengths of rows within components and off them, (2, N)."""
+    scores = centred @ components
+    left = centred - scores @ components.T
+    return np.stack([(scores**2 / variances).sum(axis=1), (left**2).sum(axis=1)])
 
 
 class NeighbourDistance(PanelMember):
@@ -362,5 +443,5 @@ class NeighbourDistance(PanelMember):
         self._prepare()
 
 
-MEMBERS: Final = (Pattern, Sums, NeighbourDistance, Energy, Level)
+MEMBERS: Final = (Pattern, Sums, NeighbourDistance, Energy, RecentRows)
 """In the order in which they stand in fitted arrays."""
