@@ -118,15 +118,17 @@ def uci(root, half):
 
 
 def rosa(root, half):
-    """Yield one task; it has no development half."""
-    columns = table(next(root.rglob("merged_data402.csv")))
+    """Yield one task."""
+    healthy, columns = (
+        table(next(root.rglob(f"merged_data{number}.csv"))) for number in (104, 402)
+    )
     with next(root.rglob("merged_data402.csv")).open(newline="") as file:
         labels = np.array([row["Binary Macro Health Mode"].strip() == "A"
                            for row in csv.DictReader(file, skipinitialspace=True)])  # fmt: skip
     names = [n for n in columns if n.startswith(ROSA)]
-    rows, middle = filled(columns, names), len(labels) // 2
-    if half:
-        yield [rows[:middle][~labels[:middle]]], [(rows[middle:], labels[middle:])]
+    middle = len(labels) // 2
+    judged = slice(middle, None) if half else slice(middle)
+    yield [filled(healthy, names)], [(filled(columns, names)[judged], labels[judged])]
 
 
 OTHERS = {"lstm-autoencoder": LstmAutoencoder}
