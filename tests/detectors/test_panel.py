@@ -43,8 +43,10 @@ from oodd_pe import make_pe
 from sklearn.decomposition import PCA
 from sklearn.neighbors import NearestNeighbors
 
-from oodd_eval import Trajectory
+from oodd_eval import Trajectory, load_split
+from oodd_eval.cli.main import main
 from oodd_eval.errors import FittedStateError, TrajectoryError, UsageError
+from oodd_eval.metrics.alarms import GuaranteedAlarm, guaranteed_contributions
 
 MIXING = np.random.default_rng(7).normal(size=(3, 8)) / 2
 
@@ -439,6 +441,42 @@ def test_a_scale_tells_values_beyond_all_nominal_ones_apart():
     assert float(heavy.unit_) == pytest.approx(7.2, rel=0.2)
     few = VoiceScale().fit([np.arange(100.0)])
     assert np.isfinite(few(np.array([-np.inf, 0.0, 1e6]))).all()
+
+
+@pytest.mark.slow
+def test_no_voice_costs_three_points_of_what_the_best_voice_alone_finds(tmp_path):
+    pytest.importorskip("mujoco")
+    sizes = {"train": 40, "calibration": 40, "test": 10, "cap": 300, "seed-base": 744}
+    options = [f"--{name}={size}" for name, size in sizes.items()]
+    main(["data", "build", "voices", *options, "--output", str(tmp_path / "split")])
+    split = load_split(tmp_path / "split")
+    assert len(split.environments) == 7
+    for environment in split.environments:
+        data = split.environment(environment)
+        panel = make_panel().fit([x.without_actions() for x in data.train])
+        said = {
+            part: [panel.voices(x.without_actions()) for x in rows]
+            for part, rows in {
+                "calibration": data.calibration,
+                "twins": data.twins,
+                **{name: data.anomalous(name) for name in data.anomalies},
+            }.items()
+        }
+
+        def share(of, said=said, data=data):
+            scores = {part: [of(x) for x in rows] for part, rows in said.items()}
+            rule = GuaranteedAlarm.fit(scores["calibration"], 0.05, "score")
+            cells = [
+                guaranteed_contributions(
+                    scores[name], scores["twins"], data.anomalous(name).effects, rule
+                )["found_within_20"]
+                for name in data.anomalies
+            ]
+            return np.nanmean([cell.value for cell in cells])
+
+        alone = [share(lambda x, voice=voice: x[voice]) for voice in said["twins"][0]]
+        joined = share(lambda x: np.max([*x.values()], axis=0))
+        assert joined >= max(alone) - 0.03, environment
 
 
 # The panel

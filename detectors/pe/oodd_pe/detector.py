@@ -34,6 +34,9 @@ TIMES: Final = 100
 FOLDS: Final = 3
 """Parts of few nominal episodes; what judges one of them has learnt from the others."""
 
+PARTS: Final = 5
+"""Parts of the episodes that charts are learnt from, each judged by charts of the others."""
+
 MANY: Final = 30
 """Episodes from which half of them, in folds of half the size, are enough to learn charts from."""
 
@@ -185,20 +188,31 @@ class ProbabilisticEnsemble(LongFitDetector):
         """Learn the charts from what the forecaster's `fit` returned for pieces.
 
         `nominal_statistics_` are then the statistics of each, (N,), of residuals that were made out
-        of fold.
+        of fold, by charts of the other episodes: a covariance of 20 sensors knows 20 that differ
+        too well.
         """
-        known = [(p, j) for p, j in zip(pieces, judged, strict=True) if j is not None]
-        evidence = [self._evidence(*pair) for pair in known]
-        self.charts_.fit(evidence)
-        self.events_.fit(
-            [self._surroundings(p) for p, _ in known],
-            [j.residuals for _, j in known],
-            [self.charts_.share(e.movement) for e in evidence],
-        )
-        self.nominal_statistics_ = [
-            _Sums(self)(p, e, self.charts_.columns(e))
-            for (p, _), e in zip(known, evidence, strict=True)
+        known = [
+            (p, j, self._evidence(p, j))
+            for p, j in zip(pieces, judged, strict=True)
+            if j is not None
         ]
+        count = min(PARTS, len(known))
+        self.nominal_statistics_ = []
+        for part in range(count):
+            self._chart([x for n, x in enumerate(known) if n % count != part] or known)
+            self.nominal_statistics_ += [
+                _Sums(self)(p, e, self.charts_.columns(e)) for p, _, e in known[part::count]
+            ]
+        self._chart(known)
+
+    def _chart(self, known: Sequence[tuple[Transitions, Assessment, Evidence]]) -> None:
+        """Learn the charts of steps whose residuals were made out of fold."""
+        self.charts_.fit([e for _, _, e in known])
+        self.events_.fit(
+            [self._surroundings(p) for p, _, _ in known],
+            [j.residuals for _, j, _ in known],
+            [self.charts_.share(e.movement) for _, _, e in known],
+        )
 
     def pieces(self, usable: Sequence[Trajectory]) -> tuple[list[Transitions], list[int]]:
         """Return pieces of episodes in random order, and the fold of each.
