@@ -75,19 +75,21 @@ _PLANES: Final = {1: [(0, 0, 1)], 2: [(1, 2, 0), (0, 1, 2)], 3: [(2, 0, 1), (1, 
 
 
 class Columns(NamedTuple):
-    """Columns by role: two or three velocities, the angles that turn them, contacts.
+    """Columns by role: two or three velocities, the angles that turn them, contacts, commands.
 
     `angles` are one, two (roll and pitch) or three (roll, pitch, yaw) angles in radians, or the
-    cosine and the sine of one (`halves`).
+    cosine and the sine of one (`halves`). Commands may stand behind the sensors, before each row
+    the last one; they are part of an impulse.
     """
 
     velocities: tuple[int, ...]
     angles: tuple[int, ...]
     contacts: tuple[int, ...]
     halves: bool
+    commands: tuple[int, ...] = ()
 
     @classmethod
-    def of(cls, roles: Sequence[str]) -> Self | None:
+    def of(cls, roles: Sequence[str], commands: int = 0) -> Self | None:
         """Return the columns of a body's frame; None where roles say of none."""
         by_role = {
             role: tuple(i for i, name in enumerate(roles) if name == role) for role in {*roles}
@@ -98,9 +100,9 @@ class Columns(NamedTuple):
         has_halves = not angles and len(halves) == 2 and "cosine" in by_role and "sine" in by_role
         if not turns or not (has_halves or len(angles) in turns):
             return None
-        return cls(
-            velocities, halves if has_halves else angles, by_role.get("contact", ()), has_halves
-        )
+        angles = halves if has_halves else angles
+        behind = tuple(range(len(roles), len(roles) + commands))
+        return cls(velocities, angles, by_role.get("contact", ()), has_halves, behind)
 
     def turns(self, rows: Floats) -> Floats:
         """Return the angles of rows in radians, (N, D) to (N, K)."""
@@ -180,7 +182,7 @@ class OwnFrame:
     @property
     def width(self) -> int:
         """Numbers of an impulse."""
-        return len(self.columns.velocities) + self.turn
+        return len(self.columns.velocities) + self.turn + len(self.columns.commands)
 
     def impulses(self, rows: Floats, speed: Floats) -> tuple[Floats, Floats]:
         """Return impulses between rows, (N - 1, K), and the last speed of the angle, (1,).
@@ -189,12 +191,12 @@ class OwnFrame:
         """
         angles = self.columns.turns(rows)
         changes = np.diff(rows[:, self.columns.velocities], axis=0) * self.factors - self.constant
-        impulses = turned(changes, waves(angles[:-1]))
-        if not self.turn:
-            return impulses, speed
-        speeds = _speeds(angles)
-        changes = np.diff(speeds, prepend=speed if speed.size else speeds[:1])
-        return np.concatenate([impulses, changes[:, None]], axis=1), speeds[-1:]
+        parts = [turned(changes, waves(angles[:-1]))]
+        if self.turn:
+            speeds = _speeds(angles)
+            parts.append(np.diff(speeds, prepend=speed if speed.size else speeds[:1])[:, None])
+            speed = speeds[-1:]
+        return np.concatenate([*parts, rows[1:, self.columns.commands]], axis=1), speed
 
     def fit(self, episodes: Sequence[Floats]) -> list[Floats]:
         """Learn from rows of nominal episodes; return each one's statistic, (T + 1,), out of fold.
@@ -205,7 +207,7 @@ class OwnFrame:
         contacts = self.columns.contacts
         every = np.concatenate(episodes)[:, contacts]
         low, high = every.min(axis=0), every.max(axis=0)
-        self.touch = tuple(np.where(high > low, (low + high) / 2, high).tolist())
+        self.touch = tuple(np.where(high > low, (low + high) / 2, high / 2).tolist())
         free = [self._free(rows) for rows in episodes]
         if sum(map(np.sum, free)) < FLIGHT or sum(part.any() for part in free) < EPISODES:
             return []
@@ -215,7 +217,8 @@ class OwnFrame:
             self.impulses(rows, np.empty(0))[0][part]
             for rows, part in zip(episodes, free, strict=True)
         ]
-        self.spread = np.maximum(np.concatenate(impulses).std(axis=0), TINY)
+        spread = np.concatenate(impulses).std(axis=0)
+        self.spread = np.where(spread < TINY, 1.0, spread)
         scaled = [x / self.spread for x in impulses]
         left_out = [
             Points.of(np.concatenate([x for j, x in enumerate(scaled) if j % FOLDS != i]))
@@ -340,10 +343,10 @@ class EpisodeRun:
         self._sums = [0.0] * (len(WEIGHTS) * MEASURES)
         self._latest: tuple[Floats, Floats] | None = None
 
-    def __call__(self, row: NDArray[np.float32]) -> float:
+    def __call__(self, row: Floats) -> float:
         """Return the statistic after the next row."""
         frame = self._frame
-        sums = self.sums(self.distances(row.astype(np.float64), frame.points), frame.usual)
+        sums = self.sums(self.distances(row, frame.points), frame.usual)
         return float((sums / frame.scale).max())
 
     def distances(self, row: Floats, points: Points) -> Floats:
@@ -394,7 +397,8 @@ class EpisodeRun:
             size = len(columns.velocities)
             axes = turned(np.eye(size), waves(np.repeat(angles, size, axis=0)))
             shares[[*columns.velocities]] = (axes @ (difference * spread)[:size]) ** 2
-            shares[[*columns.angles]] = (difference[size:] ** 2).sum() * (spread[:size] ** 2).mean()
+            turn = difference[size : size + self._frame.turn]
+            shares[[*columns.angles]] = (turn**2).sum() * (spread[:size] ** 2).mean()
         total = shares.sum()
         return shares / total if total > 0 else np.full(sensors, 1 / sensors)
 
@@ -442,7 +446,10 @@ def _successive(series: Sequence[Floats], free: Sequence[NDArray[np.bool_]]) -> 
 
 
 class FrameVoice(Voice):
-    """Impulses in the body's axes that are far from nominal ones, where roles say of axes."""
+    """Impulses in the body's axes that are far from nominal ones, where roles say of axes.
+
+    With actions: far from those of the same command.
+    """
 
     name: ClassVar[str] = "frame"
 
@@ -452,26 +459,33 @@ class FrameVoice(Voice):
 
     def fit(self, episodes: Sequence[Trajectory]) -> list[Floats]:
         """See `Voice`."""
-        columns = Columns.of(self._panel.roles)
+        commands = episodes[0].actions.shape[1] if self._panel.actions else 0
+        columns = Columns.of(self._panel.roles, commands)
         if columns is None:
             return []
         self.frame_ = OwnFrame(columns)
-        rows = [episode.observations.astype(np.float64) for episode in episodes]
-        return [x[self._panel.horizon :] for x in self.frame_.fit(rows)]
+        return [x[self._panel.horizon :] for x in self.frame_.fit([*map(self._rows, episodes)])]
+
+    def _rows(self, episode: Trajectory) -> Floats:
+        """Return observations with the command before each, (T + 1, D + A)."""
+        rows = episode.observations.astype(np.float64)
+        if not self._panel.actions:
+            return rows
+        commands = np.pad(episode.actions.astype(np.float64), ((1, 0), (0, 0)))
+        return np.concatenate([rows, commands], axis=1)
 
     def rows(self, episode: Trajectory) -> Floats:
         """See `Voice`."""
-        run = EpisodeRun(self.frame_)
-        statistic = [run(row) for row in episode.observations]
+        statistic = [*map(EpisodeRun(self.frame_), self._rows(episode))]
         return np.array(statistic[self._panel.horizon :])
 
     def shares(self, episode: Trajectory) -> Floats:
         """See `Voice`."""
         run = EpisodeRun(self.frame_)
         shares = np.empty(episode.observations.shape)
-        for t, row in enumerate(episode.observations):
+        for t, row in enumerate(self._rows(episode)):
             run(row)
-            shares[t] = run.shares(len(row))
+            shares[t] = run.shares(shares.shape[1])
         return shares[self._panel.horizon :]
 
     def reset(self) -> None:
@@ -480,9 +494,11 @@ class FrameVoice(Voice):
 
     def update(self, observation: NDArray[np.float32], action: NDArray[np.float32] | None) -> float:
         """See `Voice`."""
-        del action
         self._t, self._sensors = self._t + 1, len(observation)
-        statistic = self._run(observation)
+        row = observation.astype(np.float64)
+        if commands := len(self.frame_.columns.commands):
+            row = np.append(row, np.zeros(commands) if action is None else action)
+        statistic = self._run(row)
         return statistic if self._t >= self._panel.horizon else math.nan
 
     def shares_last(self) -> Floats:
@@ -491,11 +507,11 @@ class FrameVoice(Voice):
 
     def state(self) -> State:
         """See `Voice`."""
-        return self.frame_.arrays()
+        return {**self.frame_.arrays(), "commands": np.array(len(self.frame_.columns.commands))}
 
     def restore(self, state: State) -> None:
         """See `Voice`."""
-        columns = Columns.of(self._panel.roles)
+        columns = Columns.of(self._panel.roles, int(take(state, "commands", (), "i")))
         if columns is None:
             raise FittedStateError("the state has a body's frame, expected roles that say of one")
         self.frame_ = OwnFrame(columns)
