@@ -483,6 +483,11 @@ class LearnsNothingFromIt(Good):
         super().__init__(seed=seed, horizon=horizon, power=power)
 
 
+@breaks("roles", "unexpected keyword argument 'roles'", roles=True)
+class TakesNoRoles(Good):
+    pass
+
+
 @breaks("shared-fit", "a fit of horizon 1, restored for horizon 3, differs from a")
 class FitsItsHorizon(Good):
     def fit(self, nominal):

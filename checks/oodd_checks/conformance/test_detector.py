@@ -166,6 +166,15 @@ def test_baseline(trial: Trial) -> None:
     )
 
 
+def test_roles(trial: Trial) -> None:
+    """A detector that declares roles of sensors takes them; without axes in them it works, too."""
+    if not trial.spec.roles:
+        pytest.skip("does not ask for roles of sensors")
+    trial.fitted()
+    for roles in (("velocity", "velocity", "angle"), ("reference", "measured", "contact")):
+        _check_scores(trial, trial.fit(roles=roles), trial.horizon, trial.nominal(2))
+
+
 def test_horizon(trial: Trial) -> None:
     """Another horizon is honoured: undefined for no more rows than it, scores beyond them."""
     # Not the one of all the other checks, and long enough to tell from a fixed block.

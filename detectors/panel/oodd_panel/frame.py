@@ -481,12 +481,11 @@ class FrameVoice(Voice):
 
     def shares(self, episode: Trajectory) -> Floats:
         """See `Voice`."""
-        run = EpisodeRun(self.frame_)
-        shares = np.empty(episode.observations.shape)
-        for t, row in enumerate(self._rows(episode)):
+        run, shares = EpisodeRun(self.frame_), []
+        for row in self._rows(episode):
             run(row)
-            shares[t] = run.shares(shares.shape[1])
-        return shares[self._panel.horizon :]
+            shares.append(run.shares(episode.observation_dim))
+        return np.stack(shares[self._panel.horizon :])
 
     def reset(self) -> None:
         """See `Voice`."""
