@@ -108,7 +108,8 @@ class NominalData:
     ) -> Self:
         """Take the arguments of `Watchdog.fit`; what is None is a split's own, if it has it."""
         further: list[Trajectory] = []
-        recorded, others = True, (None, None)
+        recorded = True
+        others: Sequence[Sequence[Hashable] | None] = (None, None)
         if isinstance(train, EnvironmentData):
             if calibration is not None:
                 raise UsageError(

@@ -177,9 +177,9 @@ class Calibration:
         standardization, episodes = None, np.arange(len(scores))
         if kind == "cusum":
             standardizing, episodes = halves(numbers)
-            standardization = Standardization.fit([scores[i] for i in standardizing])
+            standardization = Standardization.fit([scores[i] for i in standardizing.tolist()])
         unbounded = GuaranteedAlarm(standardization, math.inf)
-        largest = tuple(unbounded.largest(scores[i]) for i in episodes)
+        largest = tuple(unbounded.largest(scores[i]) for i in episodes.tolist())
         count = len({*numbers.tolist()})
         counts = len(scores), tuple(numbers[episodes].tolist()), count
         return cls(kind, standardization, largest, *counts)
@@ -479,7 +479,8 @@ def rolling_rules(
         Where a threshold would be infinite.
     """
     rules = [calibration.rule(level)]
-    for scores, recording in zip(nominal, recordings or [None] * len(nominal), strict=True):
+    numbers: Sequence[int | None] = recordings or [None] * len(nominal)
+    for scores, recording in zip(nominal, numbers, strict=True):
         calibration = calibration.joined(calibration.unbounded.largest(scores), recording)
         rules.append(calibration.rule(level))
     return rules

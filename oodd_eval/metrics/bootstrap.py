@@ -228,10 +228,11 @@ def drawn_cell(
     environment: str, seed: int, contribution: Contribution, condition: str = ""
 ) -> DrawnCells:
     """Return one cell of a detector seed; the condition matters where episodes have no twins."""
-    both = np.array([[contribution.numerator], [contribution.denominator]])
-    terms, nominal = sums_of_recordings(both, contribution.nominal, contribution.recordings)
+    terms = np.array([[contribution.numerator], [contribution.denominator]])
+    terms, nominal = sums_of_recordings(terms, contribution.nominal, contribution.recordings)
     median, deviations = contribution.median, [contribution.deviations]
-    return DrawnCells(environment, [seed], *terms, median, nominal, condition, deviations)
+    both = terms[0], terms[1]
+    return DrawnCells(environment, [seed], *both, median, nominal, condition, deviations)
 
 
 def sums_of_recordings(
@@ -261,9 +262,9 @@ def sums_of_recordings(
         present, unit = np.unique(np.array(recordings[part], np.intp), return_inverse=True)
         if len(present) == 1:
             present = unit = np.arange(len(unit))
-        of_part = np.zeros((*terms.shape[:-1], len(present)))
-        np.add.at(of_part, (..., unit), terms[..., part])
-        sums.append(of_part)
+        order = np.argsort(unit, kind="stable")
+        starts = np.flatnonzero(np.diff(unit[order], prepend=-1))
+        sums.append(np.add.reduceat(terms[..., part][..., order], starts, axis=-1))
     return np.concatenate(sums, axis=-1), sums[0].shape[-1]
 
 

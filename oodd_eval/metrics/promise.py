@@ -210,14 +210,20 @@ class EpisodeMeans(NamedTuple):
     recordings: Sequence[Hashable] | None = None
 
     @property
-    def count(self) -> int:
+    def units(self) -> int:
         """Number of recordings."""
         return len(self.lengths) if self.recordings is None else len({*self.recordings})
 
     def by_recording(self) -> "EpisodeMeans":
-        """Return the means of recordings."""
+        """Return the means of recordings.
+
+        Returns
+        -------
+        EpisodeMeans
+            Of each recording, whose windows count alike.
+        """
         unit = numbered(self.recordings, len(self.lengths))
-        share = (unit == np.arange(self.count)[:, None]) * window_weights(unit)
+        share = (unit == np.arange(self.units)[:, None]) * window_weights(unit)
         return EpisodeMeans(share @ self.means, np.rint(share @ self.lengths).astype(np.int64))
 
 
@@ -251,11 +257,11 @@ def promises(
     list of PromiseFinding
         The number of episodes first, then what was tested.
     """
-    findings = [enough_episodes(len(calibration.lengths), kinds, calibration.count)]
+    findings = [enough_episodes(len(calibration.lengths), kinds, calibration.units)]
     parts, noun = [train, calibration, nominal], "episodes"
     # Where recordings are too few for any level, figures count windows, and windows are compared.
-    has_levels = any(offered_levels(calibration.count, kind) for kind in kinds)
-    if has_levels and any(part.count < len(part.lengths) for part in parts):
+    has_levels = any(offered_levels(calibration.units, kind) for kind in kinds)
+    if has_levels and any(part.units < len(part.lengths) for part in parts):
         parts, noun = [part.by_recording() for part in parts], "recordings"
         train, calibration, nominal = parts
     if recorded:

@@ -249,7 +249,7 @@ class Recalibration:
         levels = offered_levels(n, alarm)
         largest = np.zeros((DRAWS, 0))
         if levels:
-            largest = _largest([scores[i] for i in indices], statistic)
+            largest = _largest([scores[i] for i in indices.tolist()], statistic)
             draws = draws.of_windows(unit[indices])
         weights = {
             suffix: None if no_promise(n, count, level, alarm) else window_weights(unit[indices])

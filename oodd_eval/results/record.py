@@ -218,6 +218,9 @@ class Record:
     counts
         Numbers of trajectories used, by part; ``nominal`` are nominal test episodes that are no
         twins, ``test`` the anomalous ones.
+    recordings
+        Numbers of the recordings that these are windows of, one an episode, of ``calibration``,
+        ``nominal`` and ``test``; empty where each episode is a recording.
     per_trajectory
         For each metric that is a ratio of sums, its numerators and denominators in test order:
         shape (2, n). Without twins, nominal test episodes come first, then the anomalous ones.
@@ -345,7 +348,7 @@ class Record:
         ``training``, ``paired``, ``rolling``, ``note``, ``recordings`` and ``calibration_draws``
         are left out where they say nothing.
         """
-        silent = {
+        silent: dict[str, Any] = {
             "training": "nominal",
             "magnitude": None,
             "paired": True,

@@ -545,15 +545,15 @@ def unpromised(record: Record, suffix: str) -> str:
 def _unpromised(board: Board, column: Column) -> list[str]:
     """Return which promises a column of alarms lacks, a sentence for each reason."""
     suffix = f"at_{column.metric.rpartition('_at_')[2]}"
-    shown = [e for e in board.environments if not column.environments or e in column.environments]
+    environments = [e for e in board.environments if not column.environments or e in column.environments]
     rows: dict[tuple[str, str], dict[str, None]] = {}
     for r in board.records:
-        text = unpromised(r, suffix) if r.environment in shown else ""
+        text = unpromised(r, suffix) if r.environment in environments else ""
         rows.setdefault((r.environment, text), {})[str(r.setting)] = None
     several = len(rows) > 1
     return [
-        UNPROMISED + f" {place}, {_listed(of_text, 'rows')}:" * several + f" {text}."
-        for (place, text), of_text in rows.items()
+        UNPROMISED + f" {environment}, {_listed(of_text, 'rows')}:" * several + f" {text}."
+        for (environment, text), of_text in rows.items()
         if text
     ]
 

@@ -396,8 +396,8 @@ def _scan_with(
     terms = _Terms("a watchdog", fdr, notes, watchdog.rule.threshold)
     if (calibration := watchdog.calibration) is not None:
         reference = _Reference.of(np.array(calibration.largest), np.array(calibration.recordings))
-        windows = reference.count > len({*calibration.recordings})
-        enough = (reference.count + 1) * fdr >= len(episodes) and not windows
+        windows = reference.units > len({*calibration.recordings})
+        enough = (reference.units + 1) * fdr >= len(episodes) and not windows
         terms = replace(terms, reference=reference, exact=enough and not calibration.rolling)
     return _verdict(judged, watchdog.sensors, terms)
 
@@ -538,9 +538,9 @@ class _Reference(NamedTuple):
         return cls(largest, window_weights(numbers) if is_enough else np.ones(len(largest)))
 
     @property
-    def count(self) -> int:
+    def units(self) -> int:
         """Number of recordings, or of windows that count as such."""
-        return round(self.weights.sum())
+        return round(float(self.weights.sum()))
 
 
 def _verdict(judged: Sequence[_Judged], names: Sequence[str], terms: _Terms) -> Scan:
@@ -558,7 +558,7 @@ def _verdict(judged: Sequence[_Judged], names: Sequence[str], terms: _Terms) -> 
     for i, tail in enumerate(tails):
         if tail is not None and largest[i] > tail.start and not terms.exact:
             p[i] = tail.p(largest[i])
-    fewest = min(reference.count for reference in references) + 1
+    fewest = min(reference.units for reference in references) + 1
     notes, has_p_values = [*terms.notes], fewest >= LEAST
     if not has_p_values:
         p[:] = math.nan
