@@ -117,6 +117,10 @@ _RECORD: Final[Mapping[str, Rule]] = {
     "counts": Rule(
         lambda value: all(0 <= n <= MOST_TEST * 50 for n in value.values()), "few trajectories"
     ),
+    "recordings": Rule(
+        lambda value: all(0 <= n <= MOST_TEST * 50 for numbers in value.values() for n in numbers),
+        "numbers of recordings",
+    ),
     **dict.fromkeys(("seconds_fit", "seconds_score", "steps_scored", "peak_rss_mb"), _COST),
 }
 
@@ -152,6 +156,9 @@ def _problems(record: Record) -> Iterator[tuple[str, str]]:
             yield f"per_trajectory.{short(name)}", "is there without its metric"
         if not len(terms[0]) == trajectories <= MOST_TEST:
             yield f"per_trajectory.{short(name)}", f"has {len(terms[0])} terms, not {trajectories}"
+    n = len(record.recordings_of_terms)
+    if record.recordings and not record.paired and n != trajectories:
+        yield "recordings", f"are of {n} episodes, not {trajectories}"
     every = np.array([*record.per_trajectory.values()]).reshape(-1, 2, trajectories)
     top, bottom = every[:, 0], every[:, 1]
     if not np.isfinite(every).all() or (bottom < 0).any() or top[bottom == 0].any():

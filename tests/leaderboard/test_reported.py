@@ -2,10 +2,12 @@
 
 import json
 import lzma
+from dataclasses import replace
 
 import pytest
 from helpers_records import example, make_record
 from oodd_leaderboard.entry import Entry
+from oodd_leaderboard.formats import check_record
 from oodd_leaderboard.pages import build, differences, read_leaderboard
 from oodd_leaderboard.reported import (
     MOST_PACKED,
@@ -57,6 +59,7 @@ WRONG = {
     "terms": ("per_trajectory.auc_matched", [[0.5], [1.0]]),
     "ratio": ("per_trajectory.auc_matched", [[0.5, 0.5], [0.0, 1.0]]),
     "metric": ("metrics.made_up", {"value": 1.0, "low": 1.0, "high": 1.0, "n": 1}),
+    "recordings": ("recordings", {"test": [-1]}),
     "field": ("trust", "re-run"),
     "type": ("horizon", "1"),
 }
@@ -73,6 +76,15 @@ def test_a_wrong_record_is_refused_with_file_line_and_field(tmp_path, case):
     assert "records.jsonl:2" in said
     assert path.rpartition(".")[0].partition(".")[0] in said
     assert said.isprintable()
+
+
+def test_recordings_of_other_episodes_are_refused():
+    record = RECORDS[0]
+    counts = {"nominal": 0, "test": len(record.per_trajectory["auc_matched"][0])}
+    alone = replace(record, paired=False, counts=counts)
+    check_record(replace(alone, recordings={"test": (0,) * counts["test"]}), "line")
+    with pytest.raises(ResultsError, match="recordings: are of 1 episodes"):
+        check_record(replace(alone, recordings={"test": (0,)}), "line")
 
 
 @pytest.mark.parametrize(
