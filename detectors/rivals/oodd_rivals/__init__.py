@@ -16,6 +16,7 @@ from oodd_rivals.network_parameters import (
     WorldModelParameters,
 )
 from oodd_rivals.parameters import (
+    ArcadeParameters,
     DeedeeParameters,
     KnnParameters,
     PaanoParameters,
@@ -107,6 +108,16 @@ def oodd_detectors() -> list[DetectorSpec]:
             requires=("torch", "sklearn"),
             extra="oodd-eval[reference]",
             seconds=20,
+        ),
+        _spec(
+            name="arcade-a",
+            detector="arcade:Arcade",
+            parameters=ArcadeParameters,
+            summary="linear forecast whose heads learn the episode, and evidence that they changed",
+            reference="Yadav, Das, Song, Kaski & Pan (2025), ARCADE",
+            inputs="observations+actions",
+            deterministic=True,
+            alarm="score",
         ),
         *_networks(),
     ]

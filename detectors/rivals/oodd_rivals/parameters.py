@@ -80,3 +80,11 @@ class PaanoParameters:
         choices=("kept", "one"),
         help="whether embeddings are compared as they are, or by their directions alone",
     )
+
+
+@dataclass(frozen=True, slots=True)
+class ArcadeParameters:
+    """Parameters of `arcade-a`."""
+
+    lags: int = parameter(12, low=6, help="latest rows and commands of the forecast")
+    rank: int = parameter(4, low=0, help="directions in which a sensor's head differs by episode")
