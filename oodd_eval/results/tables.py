@@ -545,7 +545,9 @@ def unpromised(record: Record, suffix: str) -> str:
 def _unpromised(board: Board, column: Column) -> list[str]:
     """Return which promises a column of alarms lacks, a sentence for each reason."""
     suffix = f"at_{column.metric.rpartition('_at_')[2]}"
-    environments = [e for e in board.environments if not column.environments or e in column.environments]
+    environments = [
+        e for e in board.environments if not column.environments or e in column.environments
+    ]
     rows: dict[tuple[str, str], dict[str, None]] = {}
     for r in board.records:
         text = unpromised(r, suffix) if r.environment in environments else ""
