@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import asdict, astuple, dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Self, TypeAlias
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,25 +25,23 @@ from oodd_eval.metrics.alarms import (
     Calibration,
     GuaranteedAlarm,
     Monitor,
-    halves,
+    joined,
     least_episodes,
-    numbered,
     too_few,
 )
 from oodd_eval.metrics.cusum import Standardization
+from oodd_eval.metrics.faults import ParetoTail, StreamScale, readings
 from oodd_eval.names import check_known, counted
 from oodd_eval.plugins.contract import AnyDetector, StorableDetector, copied
-from oodd_eval.plugins.state import pack, read_state, write_state
+from oodd_eval.plugins.state import pack, read_state, take, write_state
 from oodd_live.handle import DetectorHandle, has_actions, streaming
 from oodd_live.nominal import Episode, Nominal, NominalData
 from oodd_live.reading import EpisodeAlarm, Reading, RunLength
-from oodd_live.stream import ACTION, MARGIN, OBSERVATION, Stream, StreamFault, StreamLimits
+from oodd_live.stream import OBSERVATION, Stream
 
 KIND: Final = "watchdog/4"
 DETECTOR: Final = "detector."
 """Prefix of the detector's arrays among those of a saved watchdog."""
-
-_LISTED: Final = 5  # episodes and sensors that a message names
 
 Floats = NDArray[np.float64]
 
@@ -62,8 +60,8 @@ class Settings:
 class Watchdog:
     """A fitted detector with a threshold, fed one observation at a time; made by `fit` or `load`.
 
-    An alarm is raised when the statistic of the scores exceeds the threshold, or when readings are
-    no measurements any more. Nothing that a sensor sends is an exception.
+    An alarm is raised when the statistic exceeds the threshold: that of the scores, or the one that
+    is as rare as the faults of the sensors. Nothing that a sensor sends is an exception.
 
     Attributes
     ----------
@@ -71,7 +69,7 @@ class Watchdog:
         How rare false alarms are, in words.
     notes
         What was found out about the promise, in sentences: drift, whether calibration is like what
-        is judged, calibration episodes with faults of sensors.
+        is judged.
     run_length
         The promised mean time between false alarms with its interval; None with an ``alpha``.
     calibration
@@ -85,18 +83,22 @@ class Watchdog:
         handle: DetectorHandle,
         calibration: Calibration | None,
         rule: GuaranteedAlarm,
-        limits: StreamLimits,
+        tail: ParetoTail,
+        stream: StreamScale,
+        rest: Floats,
         nominal: Nominal,
         settings: Settings,
         run_length: RunLength | None,
         notes: Sequence[str] = (),
     ) -> None:
         self._handle, self.calibration, self.rule = handle, calibration, rule
-        self._limits, self._nominal, self.sensors = limits, nominal, list(nominal.sensors)
+        self._tail, self._scale, self._rest = tail, stream, rest
+        self._nominal, self.sensors = nominal, list(nominal.sensors)
         self.settings, self.run_length, self.notes = settings, run_length, list(notes)
         self._live = streaming(handle.detector)
         self._explain_last = getattr(self._live, "explain_last", None)
-        self._stream = Stream(limits, settings.rate, nominal.baseline)
+        commands = rest if handle.actions else ()
+        self._stream = Stream(stream, commands, settings.rate, nominal.baseline)
         # Rows at the start that are not judged, and rows that the detector is not shown.
         self._rows = nominal.baseline.rows if nominal.baseline else 0
         self._hidden = 0 if handle.adapts else self._rows
@@ -117,7 +119,6 @@ class Watchdog:
         baseline: int | None = None,
         offsets: Sequence[float] | None = None,
         recordings: Sequence[Hashable] | None = None,
-        margin: float = MARGIN,
         latch: bool = True,
         hold_off: int = 0,
         statistic: str | None = None,
@@ -163,9 +164,6 @@ class Watchdog:
             For each calibration episode the recording that it is a window of, such as its file; an
             environment of a split knows them. Windows of one recording count once, and too few
             recordings promise nothing.
-        margin
-            Share of a sensor's range in training by which a reading may leave it, before it is no
-            measurement any more; infinite to leave it to the detector.
         latch
             Whether an alarm stays until `acknowledge`, and not only as long as its cause.
         hold_off
@@ -183,8 +181,7 @@ class Watchdog:
         Raises
         ------
         UsageError
-            When the calibration episodes are too few for the promise, too many of them have faults
-            of sensors, or an argument is wrong.
+            When the calibration episodes are too few for the promise, or an argument is wrong.
         """
         if rate is not None and not rate > 0:
             raise UsageError(f"rate={rate!r}, expected observations in a second, above 0")
@@ -212,15 +209,16 @@ class Watchdog:
         settings = Settings(alpha, confidence, data.rate, latch, hold_off)
         if hours is not None:
             _check_hours(hours, settings)
-        if not margin >= 0:
-            raise UsageError(f"margin={margin!r}, expected a share of a range, 0 or more")
         training, calibrating = data.train, data.calibration
         _check_shares(settings)
         _check_enough(len(calibrating), settings, handle.alarm, hours)
         handle.detector.fit([handle.visible(x, nominal.baseline) for x in training])
-        # Without a guarantee to keep exact, the limits may know what the threshold is from.
-        limit_episodes = training if hours is None else training + calibrating
-        limits = StreamLimits.fit(limit_episodes, map(nominal.judged, limit_episodes), margin)
+        stream = StreamScale.of_episodes(training, calibrating, nominal.baseline)
+        rest = np.concatenate([x.actions for x in training]).mean(axis=0, dtype=np.float64)
+        faults = [
+            stream.without(i).surprise(*readings(x, nominal.baseline))
+            for i, x in enumerate(calibrating)
+        ]
         scores = [handle.scores(x, nominal.baseline) for x in calibrating]
         findings = data.findings()
         notes = [finding.text for finding in findings]
@@ -228,17 +226,17 @@ class Watchdog:
             if finding.doubt:
                 warnings.warn(finding.text, PromiseWarning, stacklevel=2)
         if hours is None:
-            faults = [limits.faults(x, nominal.baseline) for x in calibrating]
-            fitted = _calibrated(scores, faults, handle.alarm, data.recordings)
+            largest = [float(surprise.max()) for surprise in faults]
+            fitted = Calibration.fit(scores, handle.alarm, data.recordings, largest)
             if text := fitted.no_promise(alpha, confidence):
                 warnings.warn(text, PromiseWarning, stacklevel=2)
                 notes.insert(0, text)
-            rule = _guaranteed(fitted, faults, settings, nominal.sensors)
-            if any(faults):
-                notes.append(_faults_note(faults, nominal.sensors))
-            return cls(handle, fitted, rule, limits, nominal, settings, None, notes)
-        rule, run_length = _with_run_length(scores, handle.alarm, hours, settings.rate or 0.0)
-        return cls(handle, None, rule, limits, nominal, settings, run_length, notes)
+            rule = fitted.rule(alpha, confidence)
+            tail = fitted.tail or ParetoTail.fit(fitted.largest)
+            return cls(handle, fitted, rule, tail, stream, rest, nominal, settings, None, notes)
+        rate = settings.rate or 0.0
+        rule, tail, length = _with_run_length(scores, faults, handle.alarm, hours, rate)
+        return cls(handle, None, rule, tail, stream, rest, nominal, settings, length, notes)
 
     @property
     def promise(self) -> str:
@@ -270,6 +268,7 @@ class Watchdog:
         self._t = -1
         self._largest = -math.inf
         self._causes: frozenset[str] = frozenset()
+        self._faults: dict[int | str, str] = {}
         self._known = self._causes
         self._held = 0
         self.raised: Reading | None = None
@@ -437,15 +436,14 @@ class Watchdog:
             score = math.nan
         above = self._monitor.update(score)
         self._whole.update(score)
-        self._largest = max(self._largest, self._whole.statistic)
-        faults = {
-            str(d): fault
-            for d, fault in self._stream.faults.items()
-            if d != ACTION or self._handle.actions
-        }
-        if faults:
-            self._largest = math.inf  # an alarm at any threshold
-        self._causes = frozenset(faults) | ({"statistic"} if above else set())
+        value = -math.inf
+        if self._stream.surprise:
+            value = float(self._tail.value(self._stream.surprise))
+        self._largest = max(self._largest, self._whole.statistic, value)
+        self._faults = {}
+        if value > self.rule.threshold:
+            self._faults = self._stream.faults(self._tail, self.rule.threshold)
+        self._causes = frozenset(map(str, self._faults)) | ({"statistic"} if above else set())
         self._known &= self._causes
         new = bool(self._causes - self._known) and not self._held
         self._held = max(0, self._held - 1)
@@ -456,12 +454,12 @@ class Watchdog:
         reading = Reading(
             self._t,
             math.nan if math.isnan(score) else score,
-            self._monitor.statistic,
+            max(self._monitor.statistic, value),
             self.rule.threshold,
             alarm,
             sensors,
             onset,
-            {self._name(d): fault for d, fault in self._stream.faults.items() if str(d) in faults},
+            {self._name(d): fault for d, fault in self._faults.items()},
         )
         if new and not self.raised:
             self.raised = reading
@@ -476,11 +474,12 @@ class Watchdog:
 
     def _blamed(self) -> tuple[dict[str, float], int | None]:
         """Return shares by sensor and the onset: from faults where there are any."""
-        if suspects := self._stream.suspects:
-            # Those beyond their limit before those that are only odd.
-            first = [d for d in suspects if d in self._stream.faults] or list(suspects)
-            return {self._name(d): 1 / len(first) for d in first}, min(suspects.values())
-        if OBSERVATION in self._stream.faults or self._explain_last is None:
+        # Those that raise an alarm before those that are only odd.
+        faulty = [d for d in self._faults if isinstance(d, int)] or self._stream.suspects
+        if faulty:
+            onset = int(self._stream.since[faulty].min())
+            return {self._name(d): 1 / len(faulty) for d in faulty}, onset
+        if OBSERVATION in self._faults or self._explain_last is None:
             return {}, None
         shares, onset = self._explain_last()
         if onset < 0:
@@ -543,6 +542,7 @@ class Watchdog:
                 "recordings": calibration.recordings,
                 "recording_count": calibration.recording_count,
             },
+            "tail": list(self._tail),
             "run_length": self.run_length and list(astuple(self.run_length)),
             "settings": asdict(self.settings),
             "notes": self.notes,
@@ -551,7 +551,8 @@ class Watchdog:
             "kind": KIND,
             "watchdog": values,
             "detector": fitted.values(),
-            **self._limits.arrays(),
+            **self._scale.arrays(),
+            "rest": self._rest,
             **self._nominal.arrays(),
             **{DETECTOR + name: array for name, array in fitted.arrays.items()},
         }
@@ -593,10 +594,14 @@ class Watchdog:
     @classmethod
     def _of(cls, state: Mapping[str, Any], detector: AnyDetector | None) -> Self:
         """Return the watchdog that all this was written of."""
-        values, limits = state["watchdog"], StreamLimits.of(state)
+        values, stream = state["watchdog"], StreamScale.of(state)
+        tail = ParetoTail(*map(_finite, values["tail"]))
+        rest = take(state, "rest", (None,))
         handle = DetectorHandle.from_state(values["made"], detector)
         names = [str(name) for name in values["sensors"]]
-        if not isinstance(handle.detector, StorableDetector) or len(names) != len(limits.mean):
+        if not isinstance(handle.detector, StorableDetector) or len(names) != len(
+            stream.limits.mean
+        ):
             raise FittedStateError(f"it does not fit {type(handle.detector).__name__}")
         nominal = Nominal.of(state, names, int(values["made"]["baseline"]))
         scale, calibration_values, length = (
@@ -611,6 +616,7 @@ class Watchdog:
             tuple(map(int, calibration_values["recordings"])),
             int(calibration_values["recording_count"]),
             bool(calibration_values["rolling"]),
+            tail,
         )
         setting_values = values["settings"]
         settings = Settings(
@@ -621,7 +627,7 @@ class Watchdog:
             hold_off=int(setting_values["hold_off"]),
         )
         rule = GuaranteedAlarm(standardization, _finite(values["threshold"]))
-        run_length = length and RunLength(*map(_finite, length))
+        length = length and RunLength(*map(_finite, length))
         arrays = {
             name.removeprefix(DETECTOR): array
             for name, array in state.items()
@@ -629,7 +635,7 @@ class Watchdog:
         }
         handle.detector.restore({**state["detector"], **arrays})
         notes = [str(note) for note in values["notes"]]
-        return cls(handle, calibration, rule, limits, nominal, settings, run_length, notes)
+        return cls(handle, calibration, rule, tail, stream, rest, nominal, settings, length, notes)
 
 
 def _finite(value: float) -> float:
@@ -669,68 +675,20 @@ def _check_enough(episodes: int, settings: Settings, kind: AlarmKind, hours: flo
         raise UsageError(too_few(f"alpha={alpha!r}", episodes, alpha, kind, confidence))
 
 
-_Faults: TypeAlias = Mapping[int | str, StreamFault]
-
-
-def _calibrated(
-    scores: Sequence[Floats],
-    faults: Sequence[_Faults],
-    kind: AlarmKind,
-    recordings: Sequence[Hashable] | None,
-) -> Calibration:
-    """Return the calibration, in which an episode with a fault alarms at any threshold."""
-    # Those that standardize stay.
-    standardizing = {*halves(numbered(recordings, len(scores)))[0].tolist()}
-    counted = [
-        np.array([np.inf]) if f and (kind == "score" or i not in standardizing) else s
-        for i, (f, s) in enumerate(zip(faults, scores, strict=True))
-    ]
-    return Calibration.fit(counted, kind, recordings)
-
-
-def _guaranteed(
-    calibration: Calibration, faults: Sequence[_Faults], settings: Settings, sensors: Sequence[str]
-) -> GuaranteedAlarm:
-    """Return the alarm; `UsageError` names what is at fault where nothing could exceed it."""
-    threshold = calibration.threshold(settings.alpha, settings.confidence)
-    if math.isinf(threshold) and any(faults):
-        raise UsageError(
-            f"alpha={settings.alpha!r} cannot be promised, as {_faults_note(faults, sensors)}: no "
-            "threshold would be exceeded then; leave out what was not nominal, train on what is, "
-            "declare baseline rows, let readings leave training's range by more (margin=), or "
-            "promise less"
-        )
-    return calibration.rule(settings.alpha, settings.confidence)
-
-
 def _with_run_length(
-    scores: Sequence[Floats], kind: AlarmKind, hours: float, rate: float
-) -> tuple[GuaranteedAlarm, RunLength]:
+    scores: Sequence[Floats], faults: Sequence[Floats], kind: AlarmKind, hours: float, rate: float
+) -> tuple[GuaranteedAlarm, ParetoTail, RunLength]:
     """Return the alarm that is false once in so many hours on average, and its run length."""
     standardization = Standardization.fit(scores) if kind == "cusum" else None
     unbounded = GuaranteedAlarm(standardization, math.inf)
-    # One after the other: what a sum has reached at the end of one goes on in the next.
-    joined = unbounded.statistic(np.concatenate(scores))
     ends = np.cumsum([len(s) for s in scores])
-    largest = np.array([part.max() for part in np.split(joined, ends[:-1])])
-    threshold, run_length = RunLength.fit(largest, int(ends[-1]), hours, float(rate))
-    return replace(unbounded, threshold=threshold), run_length
 
+    def largest(rows: Floats) -> Floats:
+        return np.array([part.max() for part in np.split(rows, ends[:-1])])
 
-def _faults_note(faults: Sequence[_Faults], sensors: Sequence[str]) -> str:
-    """Name the calibration episodes, sensors and rows at fault."""
-
-    def in_words(source: int | str, seen: StreamFault) -> str:
-        name = sensors[source] if isinstance(source, int) else source
-        return f"{name} {seen.fault} in rows {seen.first} to {seen.last}"
-
-    listed = [
-        f"episode {i}: {', '.join(itertools.starmap(in_words, [*seen.items()][:_LISTED]))}"
-        for i, seen in enumerate(faults)
-        if seen
-    ]
-    more = f", and {len(listed) - _LISTED} more" if len(listed) > _LISTED else ""
-    return (
-        f"{len(listed)} of {len(faults)} calibration episodes have faults of their sensors, and "
-        f"count as episodes with an alarm ({'; '.join(listed[:_LISTED])}{more})"
-    )
+    # One after the other: what a sum has reached at the end of one goes on in the next.
+    statistic = unbounded.statistic(np.concatenate(scores))
+    tail = ParetoTail.fit(largest(statistic))
+    joint = joined(statistic, tail.value(np.concatenate(faults)))
+    threshold, run_length = RunLength.fit(largest(joint), int(ends[-1]), hours, rate)
+    return replace(unbounded, threshold=threshold), tail, run_length

@@ -23,6 +23,7 @@ from oodd_eval.metrics.auc import AlarmRule, Contribution, mean_of
 from oodd_eval.metrics.binomial import incomplete_beta
 from oodd_eval.metrics.catalogue import FOUND_WITHIN, GUARANTEED, LEVELS
 from oodd_eval.metrics.cusum import DRIFT, Standardization, cusum
+from oodd_eval.metrics.faults import ParetoTail
 from oodd_eval.names import counted
 
 Floats = NDArray[np.float64]
@@ -133,6 +134,9 @@ class Calibration:
     rolling
         Whether an episode counts `FADING` to the power of its age, the number of recordings after
         its own.
+    tail
+        Of the largest statistics of the scores alone, by which faults of the stream count as
+        scores that are as rare; None where they do not count.
 
     Examples
     --------
@@ -148,6 +152,7 @@ class Calibration:
     recordings: tuple[int, ...]
     recording_count: int
     rolling: bool = False
+    tail: ParetoTail | None = None
 
     @classmethod
     def fit(
@@ -155,6 +160,7 @@ class Calibration:
         scores: Sequence[Floats],
         kind: AlarmKind = "cusum",
         recordings: Sequence[Hashable] | None = None,
+        stream: Sequence[float] | None = None,
     ) -> "Calibration":
         """Take the scores of calibration episodes.
 
@@ -168,21 +174,45 @@ class Calibration:
             For each episode the recording that it is a window of; None where each is one. Windows
             of one recording have the weight of one episode together, and for a CUSUM the recordings
             number 0, 2, 4, ... standardize. Levels that recordings are too few for count windows.
+        stream
+            Largest surprise of the stream in each episode, see `StreamScale`; None where the
+            statistic is of the scores alone.
 
         Returns
         -------
         Calibration
         """
         numbers = numbered(recordings, len(scores))
-        standardization, episodes = None, np.arange(len(scores))
+        standardization, tail, episodes = None, None, np.arange(len(scores))
         if kind == "cusum":
             standardizing, episodes = halves(numbers)
             standardization = Standardization.fit([scores[i] for i in standardizing.tolist()])
         unbounded = GuaranteedAlarm(standardization, math.inf)
-        largest = tuple(unbounded.largest(scores[i]) for i in episodes.tolist())
+        largest = np.array([unbounded.largest(scores[i]) for i in episodes.tolist()])
+        if stream is not None:
+            tail = ParetoTail.fit(largest)
+            largest = np.maximum(largest, tail.value([stream[i] for i in episodes.tolist()]))
         count = len({*numbers.tolist()})
         counts = len(scores), tuple(numbers[episodes].tolist()), count
-        return cls(kind, standardization, largest, *counts)
+        return cls(kind, standardization, tuple(largest.tolist()), *counts, tail=tail)
+
+    def joint(self, scores: Floats, stream: Floats) -> Floats:
+        """Return the statistic of an episode by row, NaN where there is no score and no fault.
+
+        Parameters
+        ----------
+        scores
+            Of the episode.
+        stream
+            Surprise of the stream in its rows, 0 where nothing is unusual.
+        """
+        statistic = np.where(np.isnan(scores), np.nan, self.unbounded.statistic(scores))
+        return statistic if self.tail is None else joined(statistic, self.tail.value(stream))
+
+    @property
+    def of_statistics(self) -> "Calibration":
+        """The same for episodes whose statistic is handed over in place of scores."""
+        return replace(self, standardization=None)
 
     @property
     def unbounded(self) -> GuaranteedAlarm:
@@ -289,6 +319,12 @@ class Calibration:
             "threshold is from have an infinite statistic, so that nothing could exceed it: "
             "calibrate with other episodes, or promise less"
         )
+
+
+def joined(statistic: Floats, as_rare: Floats) -> Floats:
+    """Return the larger of a statistic and the one that is as rare as the faults of the stream."""
+    joint: Floats = np.where(np.isneginf(as_rare), statistic, np.fmax(statistic, as_rare))
+    return joint
 
 
 FADING: Final = 0.95

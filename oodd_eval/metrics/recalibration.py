@@ -31,6 +31,7 @@ from oodd_eval.metrics.alarms import (
     AlarmKind,
     GuaranteedAlarm,
     halves,
+    joined,
     no_promise,
     numbered,
     offered_levels,
@@ -39,6 +40,7 @@ from oodd_eval.metrics.alarms import (
 )
 from oodd_eval.metrics.auc import FAR_START
 from oodd_eval.metrics.cusum import DRIFT, THRESHOLD, UNIT, Standardization
+from oodd_eval.metrics.faults import ParetoTail
 from oodd_eval.metrics.unpaired import UnpairedScores, unpaired_alarms
 
 DRAWS: Final = 64
@@ -214,11 +216,15 @@ class Recalibration:
         Of every second episode, for the guaranteed alarms; None where their statistic is the score.
     thresholds
         Of the guaranteed alarms by suffix: shape (draws,).
+    tails
+        Of the statistic of the scores in every draw, see `Calibration`; empty where the stream does
+        not count.
     """
 
     standards: Standards
     statistic: Standards | None
     thresholds: dict[str, Floats]
+    tails: Sequence[ParetoTail] = ()
 
     @classmethod
     def fit(
@@ -227,10 +233,12 @@ class Recalibration:
         alarm: AlarmKind,
         environment: str,
         recordings: Sequence[Hashable] | None = None,
+        stream: Sequence[float] | None = None,
     ) -> "Recalibration":
         """Draw the calibration episodes of an environment, given their scores.
 
         Windows of several recordings are drawn by recording, those of one as if each were one.
+        `stream` is as in `Calibration.fit`; a tail is that of all episodes in every draw.
         """
         n, numbers = len(scores), numbered(recordings, len(scores))
         count = len({*numbers.tolist()})
@@ -246,11 +254,15 @@ class Recalibration:
             first = int(unit[standardizing[:1]].sum()) % 2
             statistic = Standards.fit(whole[first::2], draws.half(first).episodes)
             draws, unit = draws.half(1 - first), unit // 2
-        levels = offered_levels(n, alarm)
+        levels, tails = offered_levels(n, alarm), list[ParetoTail]()
         largest = np.zeros((DRAWS, 0))
         if levels:
             largest = _largest([scores[i] for i in indices.tolist()], statistic)
             draws = draws.of_windows(unit[indices])
+        if levels and stream is not None:
+            tails = [ParetoTail.fit(of_draw) for of_draw in largest]
+            faults = [stream[i] for i in indices.tolist()]
+            largest = np.maximum(largest, [tail.value(faults) for tail in tails])
         weights = {
             suffix: None if no_promise(n, count, level, alarm) else window_weights(unit[indices])
             for suffix, level in levels.items()
@@ -259,6 +271,7 @@ class Recalibration:
             standards,
             statistic,
             {s: thresholds(largest, draws, level, weights[s]) for s, level in levels.items()},
+            tails,
         )
 
     def firsts(self, episodes: Sequence[Floats]) -> dict[str, Floats]:
@@ -330,13 +343,19 @@ class Recalibration:
 
     def _unpaired(self, cell: UnpairedScores, rate: float | None) -> Draws:
         values: dict[str, list[float]] = {}
-        for suffix, threshold in self.thresholds.items():
-            for i, height in enumerate(threshold.tolist()):
-                basis = None if self.statistic is None else self.statistic.of_draw(i)
-                rule = _QuickAlarm(basis, height)
-                for name, terms in unpaired_alarms(cell, rule, rate).items():
+        for i in range(DRAWS if self.thresholds else 0):
+            of_draw = cell.with_statistics(functools.partial(self._joint, i))
+            for suffix, threshold in self.thresholds.items():
+                rule = GuaranteedAlarm(None, float(threshold[i]))
+                for name, terms in unpaired_alarms(of_draw, rule, rate).items():
                     values.setdefault(f"{name}_{suffix}", []).append(terms.value)
         return {name: np.array(of_draws) for name, of_draws in values.items()}
+
+    def _joint(self, i: int, scores: Floats, stream: Floats) -> Floats:
+        basis = None if self.statistic is None else self.statistic.of_draw(i)
+        statistic = _QuickAlarm(basis, math.inf).statistic(scores)
+        statistic = np.where(np.isnan(scores), np.nan, statistic)
+        return joined(statistic, self.tails[i].value(stream)) if self.tails else statistic
 
 
 @dataclass(frozen=True, slots=True)

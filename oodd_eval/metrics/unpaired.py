@@ -12,7 +12,7 @@ of the AUC, and its value is A.
 """
 
 import itertools
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, Literal, NamedTuple
 
@@ -64,6 +64,9 @@ class UnpairedScores:
     recordings
         Number of the recording that each nominal and then each anomalous episode is a window of;
         empty where each is one. Intervals are over recordings.
+    nominal_stream, stream
+        Surprise of the stream by row of each nominal and of each anomalous episode, see
+        `StreamScale`; empty where it does not count.
     """
 
     nominal: Sequence[Floats]
@@ -73,6 +76,16 @@ class UnpairedScores:
     tasks: Sequence[str]
     clock: bool = True
     recordings: tuple[int, ...] = ()
+    nominal_stream: Sequence[Floats] = ()
+    stream: Sequence[Floats] = ()
+
+    def with_statistics(self, joint: Callable[[Floats, Floats], Floats]) -> "UnpairedScores":
+        """Return the cell with what alarms are of in place of scores: joint(scores, stream)."""
+        parts = (self.nominal, self.nominal_stream), (self.anomalous, self.stream)
+        nominal, anomalous = (
+            [*map(joint, scores, stream or map(np.zeros_like, scores))] for scores, stream in parts
+        )
+        return replace(self, nominal=nominal, anomalous=anomalous)
 
     def by_task(self) -> Iterator[tuple[list[int], list[int]]]:
         """Yield the indices of nominal and of anomalous episodes, for each task with some of both.
@@ -555,7 +568,9 @@ def _weighted(contribution: Contribution, weights: Floats) -> Contribution:
     return Contribution(contribution.numerator * weights, contribution.denominator * weights)
 
 
-def row_metrics(cell: UnpairedScores, rule: GuaranteedAlarm | None) -> Metrics:
+def row_metrics(
+    cell: UnpairedScores, rule: GuaranteedAlarm | None, statistics: Sequence[Floats] = ()
+) -> Metrics:
     """Return figures of published tables, over the anomalous episodes with intervals.
 
     Rows without a score are not judged. ``f1_rows``, ``far_rows`` and ``mar_rows`` pool the rows of
@@ -567,6 +582,8 @@ def row_metrics(cell: UnpairedScores, rule: GuaranteedAlarm | None) -> Metrics:
         The scores.
     rule
         The alarms; None leaves out all but ``vus_pr``.
+    statistics
+        What alarms of anomalous episodes are of, if not their scores.
 
     Returns
     -------
@@ -580,7 +597,7 @@ def row_metrics(cell: UnpairedScores, rule: GuaranteedAlarm | None) -> Metrics:
         judged, truth = ~np.isnan(scores), anomalous_rows(cell.intervals[i], len(scores))
         volumes[i] = volume_under_pr(scores[judged], truth[judged])
         if rule:
-            alarms = rule.statistic(scores) > rule.threshold
+            alarms = rule.statistic(statistics[i] if statistics else scores) > rule.threshold
             np.add.at(counts[:, :, i], (truth[judged].astype(int), alarms[judged].astype(int)), 1)
     metrics = {"vus_pr": mean_of(volumes)} if cell.labelled else {}
     if rule and cell.labelled:

@@ -15,14 +15,13 @@ import numpy as np
 from oodd_eval.data.parts import CALIBRATION, TWINS, AnomalousSet, EnvironmentData, LabelledSet
 from oodd_eval.data.split import Split
 from oodd_eval.errors import MissingExtraError, ResultsError, UsageError
-from oodd_eval.metrics.alarms import GuaranteedAlarm
 from oodd_eval.metrics.catalogue import LEVELS, metric_info
 from oodd_eval.names import check_known, counted, select
 from oodd_eval.prose import terminal_text
 from oodd_eval.results import plots
 from oodd_eval.results.board import Conditions, boards, level_of
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
-from oodd_eval.results.evaluate import Rules, ScoredEpisode, must_be_of, stored_scores
+from oodd_eval.results.evaluate import Rules, ScoredEpisode, must_be_of, stored_scores, with_stream
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import STATUSES, Record
 from oodd_eval.results.render import FORMATS
@@ -376,21 +375,22 @@ class Results(Sequence[Record]):
                 file = stored_scores([record], self._directory, data)
                 of_board = [r for r in self.records if Conditions.of(r) == Conditions.of(record)]
                 joining = file.parts[TWINS] if record.rolling else None
-                calibration, recordings = file.parts[CALIBRATION], record.recordings
-                rules = Rules.fit(calibration, record.alarm, joining, recordings)
-                level = level_of(of_board)
-                yield _scored(record, file, data, rules.guaranteed.get(level), level)
+                file = with_stream(file, data, [record.condition], record.limit)
+                calibration, numbers = file.parts[CALIBRATION], record.recordings
+                rules = Rules.fit(calibration, record.alarm, joining, numbers, file.stream)
+                yield _scored(record, file, data, rules, level_of(of_board))
 
 
 def _scored(
-    record: Record, file: ScoreFile, data: EnvironmentData, rule: GuaranteedAlarm | None, level: str
+    record: Record, file: ScoreFile, data: EnvironmentData, rules: Rules, level: str
 ) -> list[ScoredEpisode]:
     """Return the episodes of a cell, beside their twins where there are some."""
     episodes = data.test_set(record.condition)
     scores, n = file.parts[record.condition.part], len(episodes)
     nothing: Sequence[Any] = [None] * n
     intervals: Sequence[Any] = [()] * n
-    twins, twin_scores, nominal = nothing, nothing, None
+    twins, twin_scores, statistics, nominal = nothing, nothing, nothing, None
+    rule = rules.guaranteed.get(level)
     if isinstance(episodes, AnomalousSet):
         twins, twin_scores = data.twins, file.parts[TWINS]
         starts, effects = episodes.onsets.tolist(), episodes.effects.tolist()
@@ -400,6 +400,7 @@ def _scored(
             next((start for start, _ in spans[:1] if start >= 0), None) for spans in intervals
         ]
         effects = starts
+        statistics = [*map(rules.calibration.joint, scores, file.stream[record.condition.part])]
         reference = data.twins if len(data.twins) else data.train
         rows = np.concatenate([episode.observations for episode in reference])
         nominal = np.array([rows.mean(axis=0, dtype=float), rows.std(axis=0, dtype=float)])
@@ -419,6 +420,7 @@ def _scored(
             intervals[i],
             nominal,
             LEVELS[level],
+            statistics[i],
         )
         for i in range(len(scores))
     ]

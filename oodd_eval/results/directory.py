@@ -57,6 +57,9 @@ WRITING_SHARE: Final = 0.05  # of the time since the last writing that the next 
 EXPLAINED: Final = ("sensors", "onsets")
 """Datasets of explanations beside ``scores``: by row, the sensor named first, and the onset."""
 
+STREAM: Final = "stream"
+"""Dataset of the surprise of the stream by row beside ``scores``."""
+
 
 @dataclass(frozen=True, slots=True)
 class ScoreFile:
@@ -66,18 +69,22 @@ class ScoreFile:
     ``steps_scored``, the number of observations that ``seconds_score`` is for. `explained` are
     explanations by part, int32 arrays of shape (2, rows) with the sensors named first and the
     onsets, of anomalous parts and detectors that explain only: -1 but at first guaranteed alarms.
+    `stream` is the surprise of the stream by part, of episodes without twins only, see
+    `oodd_eval.metrics.faults`.
     """
 
     parts: dict[str, list[NDArray[np.float64]]]
     cost: dict[str, float]
     explained: dict[str, list[NDArray[np.int32]]] = field(default_factory=dict)
+    stream: dict[str, list[NDArray[np.float64]]] = field(default_factory=dict)
 
 
 class _StoredPart(NamedTuple):
-    """One part of a score file: scores and explanations, None where it has none."""
+    """One part of a score file: scores, explanations and the stream, None where it has none."""
 
     sequences: list[NDArray[np.float64]]
     explained: list[NDArray[np.int32]] | None
+    stream: list[NDArray[np.float64]] | None
 
 
 class ResultsDirectory:
@@ -213,16 +220,19 @@ class ResultsDirectory:
         """Keep the scores of a unit, beside parts of it that an earlier run has scored."""
         parts = self._all_parts(key)
         for part, sequences in scores.parts.items():
-            parts[part] = _StoredPart(sequences, scores.explained.get(part))
+            further = scores.explained.get(part), scores.stream.get(part)
+            parts[part] = _StoredPart(sequences, *further)
         path, digests = self._score_paths(key)
         # In memory: HDF5 crashes where it cannot write, as on a full disk.
         image = io.BytesIO()
         with h5py.File(image, "w") as file:
             file.attrs.update(scores.cost)
             for part in sorted(parts):
-                group, (sequences, explained) = file.create_group(part), parts[part]
+                group, (sequences, explained, stream) = file.create_group(part), parts[part]
                 group["offsets"] = np.cumsum([0, *map(len, sequences)], dtype=np.int64)
                 columns = {"scores": np.concatenate([np.zeros(0), *sequences])}
+                if stream is not None:
+                    columns[STREAM] = np.concatenate([np.zeros(0), *stream])
                 if explained is not None:
                     columns |= zip(EXPLAINED, np.concatenate(explained, axis=1), strict=True)
                 for name, data in columns.items():
@@ -259,7 +269,7 @@ class ResultsDirectory:
         """
         try:
             with self._opened(key) as file:
-                parts, explained = {}, {}
+                parts, explained, stream = {}, {}, {}
                 for part, expected in lengths.items():
                     if file[part]["offsets"].shape != (len(expected) + 1,):
                         return None
@@ -269,11 +279,13 @@ class ResultsDirectory:
                     parts[part] = stored.sequences
                     if stored.explained:
                         explained[part] = stored.explained
+                    if stored.stream is not None:
+                        stream[part] = stored.stream
                 cost = {name: float(value) for name, value in file.attrs.items()}
         except Exception:  # noqa: BLE001  h5py raises many kinds for damaged bytes
             return None
         cost = {name: value for name, value in cost.items() if 0 <= value < np.inf}
-        return ScoreFile(parts, cost, explained)
+        return ScoreFile(parts, cost, explained, stream)
 
     def _all_parts(self, key: str) -> dict[str, _StoredPart]:
         """Return all parts."""
@@ -293,14 +305,22 @@ class ResultsDirectory:
 
 def _stored_part(part: h5py.Group) -> _StoredPart:
     """Read a part of a score file; `ResultsError` when there can be no such number of scores."""
-    stored = child(part, "scores", SCORES.error)
-    SCORES.check("scores", stored.dtype, stored.nbytes)
+    sequences = _column(part, "scores")
+    stream = _column(part, STREAM) if STREAM in part else None
+    if stream is not None and [*map(len, stream)] != [*map(len, sequences)]:
+        raise SCORES.error("the stream has another number of rows than the scores")
+    return _StoredPart(sequences, _explained(part), stream)
+
+
+def _column(part: h5py.Group, name: str) -> list[NDArray[np.float64]]:
+    """Read a number a row, by episode."""
+    stored = child(part, name, SCORES.error)
+    SCORES.check(name, stored.dtype, stored.nbytes)
     if stored.ndim != 1:
-        raise SCORES.error(f"scores have shape {stored.shape}, expected one column")
+        raise SCORES.error(f"{name} have shape {stored.shape}, expected one column")
     offsets = part["offsets"][:]
     # A part may have no trajectories.
-    sequences = np.split(np.asarray(stored[:], np.float64), offsets[1:-1])[: len(offsets) - 1]
-    return _StoredPart(sequences, _explained(part))
+    return np.split(np.asarray(stored[:], np.float64), offsets[1:-1])[: len(offsets) - 1]
 
 
 def _lines(digests: Path) -> list[str]:

@@ -5,7 +5,7 @@ Cells without twins have metrics of their own, see `oodd_eval.metrics.unpaired`.
 
 import contextlib
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from types import MappingProxyType
@@ -14,6 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from oodd_eval.data.baseline import Baseline
 from oodd_eval.data.condition import NOMINAL, Condition
 from oodd_eval.data.facts import LogFacts
 from oodd_eval.data.parts import CALIBRATION, TWINS, EnvironmentData, Interval, lengths_of, parts_of
@@ -26,6 +27,7 @@ from oodd_eval.metrics.auc import AlarmRule, Contribution, auc_before, cell_cont
 from oodd_eval.metrics.bootstrap import drawn_cell, mean_interval
 from oodd_eval.metrics.catalogue import HEADLINE, LEVELS, metric_info
 from oodd_eval.metrics.cusum import Standardization
+from oodd_eval.metrics.faults import StreamScale, readings
 from oodd_eval.metrics.recalibration import Draws, PairedScores, Recalibration
 from oodd_eval.metrics.unpaired import UnpairedScores
 from oodd_eval.plugins.contract import ROLLOUT_TOLERANCE, TOLERANCE, Scores, difference
@@ -40,14 +42,14 @@ class Rules:
 
     `paper` has the paper's drift and threshold. `guaranteed` are rules by suffix, such as
     ``"at_5pct"``, that raise an alarm in at most that share of nominal episodes; levels that need
-    more calibration episodes are left out. `statistic` is theirs, with a threshold that nothing
-    exceeds. With a rolling calibration they are those after all nominal test episodes, and
-    `earlier` are those of each of these.
+    more calibration episodes are left out; without twins they are of what `calibration` joins. With
+    a rolling calibration they are those after all nominal test episodes, and `earlier` are those of
+    each of these.
     """
 
     paper: AlarmRule
     guaranteed: dict[str, GuaranteedAlarm]
-    statistic: GuaranteedAlarm
+    calibration: Calibration
     earlier: dict[str, list[GuaranteedAlarm]] = field(default_factory=dict)
 
     @classmethod
@@ -57,29 +59,35 @@ class Rules:
         alarm: AlarmKind = "cusum",
         joining: Sequence[Scores] | None = None,
         recordings: Mapping[str, Sequence[int]] = MappingProxyType({}),
+        stream: Mapping[str, Sequence[Scores]] = MappingProxyType({}),
     ) -> "Rules":
         """Standardize and find thresholds on the scores of nominal trajectories.
 
         `joining` are those of nominal test episodes that join a rolling calibration, `recordings`
-        those of a record.
+        those of a record, `stream` the surprise of the stream by part, without twins.
         """
         levels = alarms.offered_levels(len(calibration), alarm)
-        fitted = Calibration.fit(calibration, alarm, recordings.get(CALIBRATION))
+        fitted = Calibration.fit(
+            calibration, alarm, recordings.get(CALIBRATION), largest_of(stream)
+        )
+        basis = fitted.of_statistics if stream else fitted
         # A run goes on with a threshold that nothing exceeds, and counts what it misses.
         guaranteed = {
-            suffix: replace(fitted.unbounded, threshold=fitted.threshold(level))
+            suffix: replace(basis.unbounded, threshold=fitted.threshold(level))
             for suffix, level in levels.items()
         }
         paper = AlarmRule(Standardization.fit(calibration))
         if joining is None:
-            return cls(paper, guaranteed, fitted.unbounded)
+            return cls(paper, guaranteed, fitted)
+        if stream:
+            joining = [*map(fitted.joint, joining, stream[TWINS])]
         earlier: dict[str, list[GuaranteedAlarm]] = {}
         for suffix, level in levels.items():
             with contextlib.suppress(UsageError):  # too few for this level
                 further = recordings.get("nominal")
-                earlier[suffix] = alarms.rolling_rules(fitted, joining, level, further)
+                earlier[suffix] = alarms.rolling_rules(basis, joining, level, further)
         last = {suffix: rules.pop() for suffix, rules in earlier.items()}
-        return cls(paper, last, fitted.unbounded, earlier)
+        return cls(paper, last, fitted, earlier)
 
     def thresholds(self) -> dict[str, Metric]:
         """Return the thresholds of all levels as metrics.
@@ -108,6 +116,46 @@ def first_alarms(
     rule = Rules.fit(parts[CALIBRATION], alarm).guaranteed.get(HEADLINE)
     tests = {part: of_part for part, of_part in parts.items() if part not in (CALIBRATION, TWINS)}
     return {part: [rule.first(x) if rule else None for x in xs] for part, xs in tests.items()}
+
+
+def largest_of(stream: Mapping[str, Sequence[Scores]]) -> list[float] | None:
+    """Return the largest surprise of the stream in each calibration episode; None without any."""
+    return [float(rows.max()) for rows in stream[CALIBRATION]] if stream else None
+
+
+def with_stream(
+    scores: ScoreFile, data: EnvironmentData, conditions: Sequence[Condition], limit: int | None
+) -> ScoreFile:
+    """Return scores of a unit with the surprise of the stream, which counts without twins."""
+    if data.paired or len(scores.stream) == len(scores.parts):
+        return scores
+    return replace(scores, stream=stream_of(data, conditions, limit))
+
+
+def stream_of(
+    data: EnvironmentData, conditions: Iterable[Condition], limit: int | None
+) -> dict[str, list[Scores]]:
+    """Return the surprise of the stream by part and episode, see `oodd_eval.metrics.faults`.
+
+    Parameters
+    ----------
+    data
+        An environment without twins.
+    conditions
+        Whose parts are scored.
+    limit
+        Episodes of each part that are used; None for all.
+    """
+    train, calibration = islice(data.train, limit), islice(data.calibration, limit)
+    base = Baseline.fit(islice(data.train, limit), data.baseline) if data.baseline else None
+    scale = StreamScale.of_episodes(train, calibration, base)
+    return {
+        part: [
+            (scale.without(i) if part == CALIBRATION else scale).surprise(*readings(x, base))
+            for i, x in enumerate(islice(episodes, limit))
+        ]
+        for part, episodes in parts_of(data, conditions).items()
+    }
 
 
 def cell_metrics(
@@ -146,16 +194,20 @@ def cell_metrics(
     if isinstance(cell, PairedScores):
         terms |= cell_contributions(*cell, rules.paper)
     elif condition != str(NOMINAL):
-        terms |= unpaired.separability(cell, rules.statistic)
-    if isinstance(cell, UnpairedScores) and rows:
+        terms |= unpaired.separability(cell, rules.calibration.unbounded)
+    judged = cell
+    if isinstance(cell, UnpairedScores) and rules.calibration.tail is not None:
+        judged = cell.with_statistics(rules.calibration.joint)
+    if isinstance(cell, UnpairedScores) and isinstance(judged, UnpairedScores) and rows:
         # The headline, or the nearest level that is offered.
         usual = list(levels)[: [*LEVELS].index(HEADLINE) + 1][-1:]
-        terms |= unpaired.row_metrics(cell, levels[usual[0]] if usual else None)
+        rule_of_rows = levels[usual[0]] if usual else None
+        terms |= unpaired.row_metrics(cell, rule_of_rows, judged.anomalous)
     for suffix, rule in levels.items():
         of_level = (
-            alarms.guaranteed_contributions(cell.anomalous, cell.twins, cell.effects, rule)
-            if isinstance(cell, PairedScores)
-            else unpaired.unpaired_alarms(cell, rule, rate, rules.earlier.get(suffix, ()))
+            alarms.guaranteed_contributions(judged.anomalous, judged.twins, judged.effects, rule)
+            if isinstance(judged, PairedScores)
+            else unpaired.unpaired_alarms(judged, rule, rate, rules.earlier.get(suffix, ()))
         )
         terms |= {f"{name}_{suffix}": c for name, c in of_level.items()}
     if isinstance(cell, PairedScores) and explained and HEADLINE in levels:
@@ -191,12 +243,14 @@ def evaluated(
     They are ``invalid`` where scores cannot be standardized, or tell an episode from its twin
     before they differ, see `check_before_effect`.
     """
+    if not records[0].paired:
+        scores = with_stream(scores, data, [r.condition for r in records], records[0].limit)
     try:
         joining = scores.parts[TWINS] if records[0].rolling else None
         records = [replace(r, recordings=_recordings(r, scores.parts, data)) for r in records]
-        rules = Rules.fit(
-            scores.parts[CALIBRATION], records[0].alarm, joining, records[0].recordings
-        )
+        numbers = records[0].recordings
+        calibration = scores.parts[CALIBRATION]
+        rules = Rules.fit(calibration, records[0].alarm, joining, numbers, scores.stream)
     except OverflowError:
         return _invalid(
             records, "scores are too large: their sum over the calibration trajectories overflows"
@@ -206,7 +260,7 @@ def evaluated(
         return _invalid(
             records, "no score of the calibration trajectories is defined, so there is no threshold"
         )
-    cells = [cell_scores(record, scores.parts, data) for record in records]
+    cells = [cell_scores(record, scores.parts, data, scores.stream) for record in records]
     draws = _calibration_draws(records[0], cells, scores, data)
     measured = [
         _with_metrics(
@@ -363,7 +417,8 @@ def _calibration_draws(
     if first.rolling:
         return [{} for _ in cells]
     calibration, numbers = scores.parts[CALIBRATION], first.recordings.get(CALIBRATION)
-    again = Recalibration.fit(calibration, first.alarm, first.environment, numbers)
+    largest = largest_of(scores.stream)
+    again = Recalibration.fit(calibration, first.alarm, first.environment, numbers, largest)
     return again.of_cells(cells, data.logs.rate if data.logs else None)
 
 
@@ -440,7 +495,10 @@ def _distrusted(before: float) -> str:
 
 
 def cell_scores(
-    record: Record, parts: Mapping[str, Sequence[Scores]], data: EnvironmentData
+    record: Record,
+    parts: Mapping[str, Sequence[Scores]],
+    data: EnvironmentData,
+    stream: Mapping[str, Sequence[Scores]] = MappingProxyType({}),
 ) -> PairedScores | UnpairedScores:
     """Return the scores of a cell with what is known of its episodes.
 
@@ -452,6 +510,8 @@ def cell_scores(
         Scores of its unit by part.
     data
         The environment.
+    stream
+        Surprise of the stream by part, where it counts.
     """
     nominal, facts = parts[TWINS], data.logs or LogFacts()
     if data.paired:
@@ -459,13 +519,15 @@ def cell_scores(
         rows = (rows[: len(anomalous)].tolist() for rows in (episodes.onsets, episodes.effects))
         return PairedScores(anomalous, nominal, *rows)
     tasks = data.twins.tasks[: len(nominal)]
-    cell = UnpairedScores(nominal, [], [], tasks, [], facts.clock, record.recordings_of_terms)
+    of_terms, seen = record.recordings_of_terms, stream.get(TWINS, ())
+    cell = UnpairedScores(nominal, [], [], tasks, [], facts.clock, of_terms, seen)
     if record.condition == NOMINAL:
         return cell
     anomalous, labelled = parts[record.condition.part], data.labelled(record.condition)
     n = len(anomalous)
     intervals, tasks = labelled.intervals[:n], labelled.tasks[:n]
-    return replace(cell, anomalous=anomalous, intervals=intervals, tasks=tasks)
+    seen = stream.get(record.condition.part, ())
+    return replace(cell, anomalous=anomalous, intervals=intervals, tasks=tasks, stream=seen)
 
 
 def _terms(contributions: Mapping[str, Contribution]) -> dict[str, NDArray[np.float64]]:
@@ -543,6 +605,8 @@ class ScoredEpisode:
         Without a twin, the rows [start, stop) that are anomalous; a start of -1 is not known.
     nominal
         Without a twin, mean and spread of each sensor in nominal test episodes: shape (2, D).
+    statistics
+        Without a twin, what alarms are of by row; None where they are of the scores.
     level
         The largest share of nominal episodes with an alarm: 0.05, or without twins 0.1 where that
         is the strictest that is offered.
@@ -561,11 +625,17 @@ class ScoredEpisode:
     intervals: tuple[Interval, ...] = ()
     nominal: Floats | None = None
     level: float = LEVELS[HEADLINE]
+    statistics: Floats | None = None
+
+    @property
+    def judged(self) -> Floats:
+        """What alarms are of by row."""
+        return self.scores if self.statistics is None else self.statistics
 
     @property
     def alarm(self) -> int | None:
         """The row of the first alarm; None without one."""
-        return self.rule.first(self.scores) if self.rule else None
+        return self.rule.first(self.judged) if self.rule else None
 
     def delay(self, *, of_twin: bool = False) -> float:
         """Return the number of rows from the effect to the first alarm.
@@ -581,7 +651,7 @@ class ScoredEpisode:
             Infinite without an alarm; NaN where that precedes the effect, or no row follows it,
             and without a twin or a known start.
         """
-        scores = self.twin_scores if of_twin else self.scores
+        scores = self.twin_scores if of_twin else self.judged
         if self.rule is None or scores is None or self.effect is None or len(scores) <= self.effect:
             return math.nan
         first = self.rule.first(scores)

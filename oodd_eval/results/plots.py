@@ -49,7 +49,7 @@ def trajectory(episode: ScoredEpisode) -> Figure:
     upper.set_title(str(episode.cell), fontsize="medium")
     rule = episode.rule
     solid = "episode" if episode.twin is None else "anomalous"
-    drawn = (episode.twin_scores, "--", 0.5, "nominal twin"), (episode.scores, "-", 1, solid)
+    drawn = (episode.twin_scores, "--", 0.5, "nominal twin"), (episode.judged, "-", 1, solid)
     for scores, style, alpha, name in drawn:
         if scores is not None:
             statistic = scores if rule is None else rule.statistic(scores)
@@ -64,7 +64,7 @@ def trajectory(episode: ScoredEpisode) -> Figure:
         # The first rows beyond the threshold matter, not how far it goes.
         lower.set_yscale("symlog", linthresh=abs(rule.threshold) or 1.0)
         if (alarm := episode.alarm) is not None:
-            height = rule.statistic(episode.scores)[alarm]
+            height = rule.statistic(episode.judged)[alarm]
             lower.plot(alarm, height, "v", color=COLOURS[1], label=f"alarm at row {alarm}")
     _beside(lower)
     return figure

@@ -21,7 +21,7 @@ from oodd_eval.errors import UsageError
 from oodd_eval.plugins.contract import Progress
 from oodd_eval.plugins.discovery import Plugins
 from oodd_eval.results.directory import RecordWriter, ResultsDirectory
-from oodd_eval.results.evaluate import counts_of, evaluated
+from oodd_eval.results.evaluate import counts_of, evaluated, with_stream
 from oodd_eval.results.record import Record, gather
 from oodd_eval.scoring.executors import Executor, RunSettings, check_executor, open_executor
 from oodd_eval.scoring.observers import Observers
@@ -155,6 +155,8 @@ def _as_they_finish(
         scored = executor(job, progress)
         if results:
             if scored.status == "ok" and not scored.resumed:
+                conditions, limit = job.unit.conditions, job.plan.limit
+                scored.file = with_stream(scored.file, job.data, conditions, limit)
                 results.write_scores(job.unit.scores_key, scored.file)
             if scored.log:
                 write_text(results.log_path(job.unit.scores_key), scored.log)

@@ -19,8 +19,9 @@ from oodd_live import Watchdog
 from oodd_eval import Trajectory, load_split
 from oodd_eval.data.baseline import Baseline
 from oodd_eval.errors import PromiseWarning, UsageError
-from oodd_eval.metrics.alarms import STATISTICS, GuaranteedAlarm
+from oodd_eval.metrics.alarms import STATISTICS, Calibration, GuaranteedAlarm, joined
 from oodd_eval.metrics.auc import auc
+from oodd_eval.metrics.faults import StreamScale
 from oodd_eval.plugins.discovery import discover
 
 B = 20
@@ -104,7 +105,7 @@ def test_an_acknowledged_alarm_and_a_fault_count_when_an_episode_is_confirmed():
     for _ in range(10):
         watchdog.update(None)
     watchdog.confirm()
-    assert math.isinf(watchdog.calibration.largest[-1])
+    assert watchdog.calibration.tail.start < watchdog.calibration.largest[-1] < math.inf
 
 
 def test_what_cannot_join_is_refused_and_changes_nothing():
@@ -216,10 +217,15 @@ def test_a_watchdog_watches_the_statistic_and_keeps_it(tmp_path, kind):
     assert values[0] == values[1]
     # The same by hand, from the scores of the detector alone.
     scores = [dog_scores(watchdog, t.observations) for t in calibration]
-    rule = GuaranteedAlarm.fit(scores, 0.10, kind)
-    expected = rule.statistic(dog_scores(watchdog, x))
+    scale = StreamScale.of_episodes(train, calibration)
+    largest = [scale.without(i).surprise(t.observations).max() for i, t in enumerate(calibration)]
+    fitted = Calibration.fit(scores, kind, stream=largest)
+    rule, tail = fitted.rule(0.10), fitted.tail
+    faults = scale.surprise(np.asarray(x, np.float32))
+    assert faults.any()
+    expected = joined(rule.statistic(dog_scores(watchdog, x)), tail.value(faults))
     assert [s for s, _ in values[0]] == pytest.approx(expected.tolist())
-    assert [a for _, a in values[0]].index(True) == rule.first(dog_scores(watchdog, x)) >= 40
+    assert [a for _, a in values[0]].index(True) == np.argmax(expected > rule.threshold) >= 40
 
 
 def dog_scores(watchdog, rows):

@@ -6,19 +6,33 @@ import numpy as np
 import pytest
 from helpers_live import FAULTS, SENSOR_FAULTS, first_alarm, rows_of, walk, with_fault
 from oodd_live import Watchdog
-from oodd_live.stream import Stream, StreamLimits
+from oodd_live.stream import Stream
 
 from oodd_eval import Trajectory, load_split
 from oodd_eval.errors import UsageError
+from oodd_eval.metrics.faults import ParetoTail, StreamLimits, StreamScale
 
 pytestmark = pytest.mark.slow
 
 TRAIN = [walk(seed, contact=True) for seed in range(20)]
 
 
+CALIBRATION = [walk(seed, contact=True) for seed in range(50, 80)]
+USUAL = ParetoTail(0.0, 1.0, 0.0, 1.0)
+"""Of a statistic that is as large as it is surprising."""
+
+
+def stream_of(train, calibration=None, **facts):
+    return Stream(StreamScale.of_episodes(train, calibration or train), [0.0], **facts)
+
+
+def faults(stream):
+    return stream.faults(USUAL, 3.0)
+
+
 @pytest.fixture
 def stream():
-    return Stream(StreamLimits.fit(TRAIN))
+    return stream_of(TRAIN, CALIBRATION)
 
 
 def taken(stream, *observations):
@@ -31,67 +45,65 @@ def row(i, *broken, value=np.nan):
     return o
 
 
-def test_limits_are_what_sensors_do_in_nominal_episodes(stream):
-    limits = stream.limits
-    assert np.isinf(limits.still[2])
-    assert limits.still[:2].tolist() == [0, 0]
-    again = StreamLimits.of(limits.arrays())
-    for name in ("mean", "std", "low", "high", "still", "repeated", "rest"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(limits, name))
+def test_scales_are_of_what_sensors_do_in_nominal_episodes(stream):
+    scale = stream.scale
+    assert scale.limits.moving.tolist() == [1, 1, 0]
+    assert scale.per_unit[1].tolist() == [1, 1, 0]
     # Before the first good reading it is the mean.
-    np.testing.assert_allclose(taken(stream, None)[0], limits.mean, rtol=1e-6)
-    single = Stream(StreamLimits.fit([Trajectory(np.arange(50.0)[:, None])]))
+    np.testing.assert_allclose(taken(stream, None)[0], scale.limits.mean, rtol=1e-6)
+    single = stream_of([Trajectory(np.arange(50.0)[:, None])])
     taken(single, [1.0], *[[np.nan]] * 5)
-    assert single.faults == {0: "missing"}
+    assert faults(single) == {0: "missing"}
 
 
 def test_runs_are_counted_as_they_are_long():
     o = np.arange(40.0).reshape(20, 2)
     o[5:9, 0] = 3.0
-    limits = StreamLimits.fit([Trajectory(o)])
-    assert limits.still.tolist() == [3, 0]
+    limits = StreamLimits.fit([o])
+    assert limits.usual.tolist() == [3, 0]
     o[10:13] = o[9]
-    assert StreamLimits.fit([Trajectory(o)]).repeated == 3.0
+    assert StreamLimits.fit([o]).repeated == 3.0
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30, 1e300])
 def test_what_is_no_measurement_is_the_last_good_one_for_the_detector(stream, value):
-    first, *rest = taken(stream, row(0), *[row(i, 1, value=value) for i in range(1, 5)])
+    first, *rest = taken(stream, row(0), *[row(i, 1, value=value) for i in range(1, 6)])
     assert all(o[1] == first[1] for o in rest)
-    assert rest[-1][0] == np.float32(0.14)
-    assert stream.faults == {1: "missing"}
-    assert stream.suspects == {1: 1}
+    assert rest[-1][0] == np.float32(0.15)
+    assert faults(stream) == {1: "missing"}
+    assert stream.suspects == [1]
+    assert stream.since[1] == 1
 
 
 def test_a_constant_sensor_may_have_any_reading_that_is_one():
     episodes = [Trajectory(np.pad(x.observations, ((0, 0), (0, 1)))) for x in TRAIN]
-    stream = Stream(StreamLimits.fit(episodes))
-    for value, faults in ((5.0, {}), (1e30, {3: "missing"})):
+    stream = stream_of(episodes)
+    for value, expected in ((5.0, {}), (1e30, {3: "missing"})):
         stream.reset()
         taken(stream, *[[*row(i), value] for i in range(6)])
-        assert stream.faults == faults
+        assert faults(stream) == expected
 
 
 @pytest.mark.parametrize(
-    ("rows", "faults", "suspects"),
+    ("rows", "expected", "suspects"),
     [
         ([row(i, 0, value=0.5) for i in range(9)], {0: "frozen"}, None),  # and no contact
-        ([row(0), row(1, 0)], {}, {0: 1}),
-        ([row(0), row(1, 0), *map(row, range(2, 30))], {}, {}),
-        ([row(0)] * 6, {"observation": "repeated"}, {}),
-        ([row(0), *[None] * 6], {"observation": "missing"}, {}),
+        ([row(0), row(1, 0)], {}, [0]),
+        ([row(0), row(1, 0), *map(row, range(2, 30))], {}, []),
+        ([row(0)] * 6, {"observation": "repeated"}, []),
+        ([row(0), *[None] * 6], {"observation": "missing"}, []),
     ],
 )
-def test_faults_and_suspects_of_rows(stream, rows, faults, suspects):
+def test_faults_and_suspects_of_rows(stream, rows, expected, suspects):
     taken(stream, *rows)
-    assert stream.faults == faults
+    assert faults(stream) == expected
     assert suspects is None or stream.suspects == suspects
 
 
 def test_readings_beyond_those_of_training_are_a_fault_after_a_few(stream):
-    far = stream.limits.high[0] + 0.1
+    far = 2 * stream.scale.limits.high[0] + 0.1
     found = taken(stream, row(0), *[row(i, 0, value=far + 0.01 * i) for i in range(1, 5)])
-    assert stream.faults == {0: "out of range"}
+    assert faults(stream) == {0: "out of range"}
     # They are measurements, though, and the detector sees them.
     assert found[-1][0] == np.float32(far + 0.04)
 
@@ -101,31 +113,31 @@ def test_an_action_that_does_not_come_is_the_last_one_and_a_fault(stream):
     assert stream.take(row(1), [0.7])[1] == np.float32(0.7)
     for i in range(2, 7):
         assert stream.take(row(i), None if i % 2 else [np.nan])[1] == np.float32(0.7)
-    assert stream.faults == {"action": "missing"}
+    assert faults(stream) == {"action": "missing"}
 
 
 def stamped(*stamps, rate=50.0):
     """The faults after rows with these time stamps, and actions as old as the rows before."""
-    stream = Stream(StreamLimits.fit(TRAIN), rate)
+    stream = stream_of(TRAIN, rate=rate)
     for i, time in enumerate(stamps):
         stream.take(row(i), [0.0], time, time and time - 0.02)
-    return stream.faults
+    return faults(stream)
 
 
 @pytest.mark.parametrize(
-    ("stamps", "faults"),
+    ("stamps", "expected"),
     [
         (np.arange(20) * 0.02 + 1e9, {}),
         (np.arange(20) * 0.027, {}),
         (np.arange(20) * 0.04, {"observation": "irregular"}),
         (np.arange(20) * 0.008, {"observation": "irregular"}),
-        ([0.0, 0.02, *[math.nan] * 4], {"observation": "irregular", "action": "late"}),
+        ([0.0, 0.02, *[math.nan] * 6], {"observation": "irregular", "action": "late"}),
         ([0.0, None, None, 0.06, None, 0.1, None, None, None, 0.18], {}),
         ([0.0, 0.02, 5.0, 5.02, 5.04, 5.06, 5.08], {}),
     ],
 )
-def test_rows_come_one_interval_after_the_other(stamps, faults):
-    assert stamped(*stamps) == faults
+def test_rows_come_one_interval_after_the_other(stamps, expected):
+    assert stamped(*stamps) == expected
 
 
 def test_actions_from_before_the_row_before_are_late():

@@ -238,6 +238,8 @@ class Explaining(Spy):
 
 def test_explanations_of_the_detector_count():
     episodes = logs(rows=40)
+    for x in episodes:  # A range that the fault does not leave.
+        x[5:7, 0] = 300, -300
     episodes[2][20:, 0] += 200
     (odd,) = scan_episodes(episodes, sensors=SENSORS, detector=Explaining()).odd
     assert odd.sensors == {"current": 0.7, "torque": 0.2, "speed": 0.1}
@@ -396,8 +398,9 @@ def test_each_fault_of_the_stream(fault, broken):
     (seen,) = [f for f in found.faults if f.fault == name]
     assert seen.what == what
     assert 60 <= seen.row <= {"missing": 62, "repeated": 72}.get(name, 66)
-    assert found.odd
-    assert what in found.suspects
+    # Gaps are said, and decide nothing: a recording is cut there.
+    assert found.odd == (name != "gap")
+    assert (what in found.suspects) == found.odd
 
 
 def test_a_gap_between_pieces_of_one_recording():
@@ -635,9 +638,9 @@ def test_command_on_a_folder(tmp_path, capsys):
     assert main([*command, *options]) == 1
     out = capsys.readouterr().out
     odd = [line.split()[1] for line in out.splitlines() if line.startswith("odd")]
-    assert odd == ["run-05", "run-07"]
+    assert {*odd} == {"run-05", "run-07"}
     content = json.loads(outputs["json"].read_text())
-    assert content["odd"] == odd
+    assert content["odd"] == sorted(odd)
     assert content["episodes"][7]["faults"][0]["fault"] == "missing"
     assert "run-05" in outputs["html"].read_text()
     assert outputs["mcap"].stat().st_size

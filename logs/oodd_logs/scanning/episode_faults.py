@@ -1,24 +1,24 @@
 """Faults of the stream in recorded episodes: missing, frozen, out of range, gaps.
 
-Limits are what the other episodes do, so that up to a fifth of them may have the same fault.
+They are scaled on all episodes, so that up to a fifth of them may have the same fault.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
-from typing import Final
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from oodd_live.stream import FAR, Stream, StreamLimits
 
+from oodd_eval.data.baseline import Baseline
 from oodd_eval.data.trajectory import Trajectory
+from oodd_eval.metrics.faults import FAR, StreamLimits, StreamScale, readings
 from oodd_logs.episodes import Episode
 from oodd_logs.scanning.limits import SHORTEST
-from oodd_logs.scanning.outliers import ODD_SHARE, Tail
+from oodd_logs.scanning.outliers import ODD_SHARE
 
 Floats = NDArray[np.float64]
 
-_RUN: Final = 4.0  # half of a run, in rows, that no sensor is called frozen for
 _STEPS: Final = 3.0  # usual steps that a gap is longer than, at least
 
 
@@ -31,7 +31,8 @@ class EpisodeFault:
     what
         A sensor, ``"observation"`` for all at once, ``"action"`` or ``"time"``.
     fault
-        ``"missing"``, ``"frozen"``, ``"out of range"``, ``"repeated"`` or ``"gap"``.
+        ``"missing"``, ``"frozen"``, ``"saturated"``, ``"out of range"``, ``"repeated"`` or
+        ``"gap"``, which makes no episode odd.
     row
         The row with which it began or, for a gap, the first one after it.
     """
@@ -47,17 +48,14 @@ class EpisodeFault:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CleanedEpisode:
-    """An episode for detectors, with what came: float64 rows minus the sensors' usual values."""
+    """An episode for detectors, and its readings minus usual values, NaN where there is none."""
 
     trajectory: Trajectory
-    observations: Floats
+    observations: NDArray[np.float32]
 
 
-def clean(episodes: Sequence[Episode]) -> tuple[list[CleanedEpisode], Floats]:
-    """Return episodes without an offset that float32 cannot tell from, and what is no reading held.
-
-    The second value is the usual deviation of each sensor, (D,).
-    """
+def clean(episodes: Sequence[Episode]) -> list[CleanedEpisode]:
+    """Return episodes without offsets that float32 cannot tell from, what is no reading held."""
     # Medians, so that no broken number spoils them.
     offset, spread = _usual([episode.observations for episode in episodes])
     _, commanded = _usual([episode.actions for episode in episodes])
@@ -65,8 +63,9 @@ def clean(episodes: Sequence[Episode]) -> tuple[list[CleanedEpisode], Floats]:
     for episode in episodes:
         rows = episode.observations - offset
         held = _held(rows, spread), _held(episode.actions, commanded)
-        cleaned.append(CleanedEpisode(Trajectory(*held), rows))
-    return cleaned, spread
+        read = np.where(_is_good(rows, spread), rows, np.nan).astype(np.float32)
+        cleaned.append(CleanedEpisode(Trajectory(*held), read))
+    return cleaned
 
 
 def _usual(parts: Sequence[Floats]) -> tuple[Floats, Floats]:
@@ -82,12 +81,17 @@ def _usual(parts: Sequence[Floats]) -> tuple[Floats, Floats]:
     return centre, spread
 
 
+def _is_good(rows: Floats, spread: Floats) -> NDArray[np.bool_]:
+    """Return which values are readings: numbers, and no broken ones."""
+    with np.errstate(invalid="ignore"):
+        near = np.abs(rows) < np.minimum(FAR * spread, np.finfo(np.float32).max)
+    good: NDArray[np.bool_] = np.isfinite(rows) & near
+    return good
+
+
 def _held(rows: Floats, spread: Floats) -> Floats:
     """Return rows with the last reading in place of what is none, the next one at the beginning."""
-    with np.errstate(invalid="ignore"):
-        good = np.isfinite(rows) & (
-            np.abs(rows) < np.minimum(FAR * spread, np.finfo(np.float32).max)
-        )
+    good = _is_good(rows, spread)
     if good.all():
         return rows
     last = np.maximum.accumulate(np.where(good, np.arange(len(rows))[:, None], -1), axis=0)
@@ -96,68 +100,30 @@ def _held(rows: Floats, spread: Floats) -> Floats:
     return np.where(good.any(axis=0), held, 0.0)
 
 
-def stream_faults(
-    episodes: Sequence[Episode],
-    cleaned: Sequence[CleanedEpisode],
-    spread: Floats,
-    names: Sequence[str],
-    fdr: float,
-) -> list[tuple[EpisodeFault, ...]]:
-    """Return the faults of each episode, by limits from the others."""
-    each = [StreamLimits.fit([episode.trajectory]) for episode in cleaned]
-    columns = {
-        f.name: np.stack([getattr(limits, f.name) for limits in each]) for f in fields(each[0])
-    }
-    breaks = breaks_of(episodes)
-    faults = []
-    for i, (episode, rows) in enumerate(zip(episodes, cleaned, strict=True)):
-        other_limits = {name: np.delete(column, i, axis=0) for name, column in columns.items()}
-        p = fdr / len(episodes) / len(names)
-        limits = _common(other_limits, spread, p)
-        seen = _in_rows(rows.observations, episode.actions, Stream(limits), names)
-        usual = _most(np.delete(breaks, i)[:, None], p)[0]
-        faults.append((*seen, *gaps(episode.time, float(breaks[i]), usual)))
-    return faults
+def stream_scale(
+    cleaned: Sequence[CleanedEpisode], baseline: int = 0
+) -> tuple[StreamScale, list[tuple[NDArray[Any], NDArray[Any] | None]]]:
+    """Return scales of the faults of the stream from all episodes, up to a fifth of them odd.
 
+    Parameters
+    ----------
+    cleaned
+        The episodes.
+    baseline
+        Number of rows at the start of each that it is compared with.
 
-def _common(other_limits: Mapping[str, Floats], spread: Floats, p: float) -> StreamLimits:
-    """Return limits of the stream from those of single other episodes."""
-    # The range ends as far beyond that of all others as it is wide: what moves from day to day is
-    # for the p-value to judge.
-    low, high = other_limits["low"].min(axis=0), other_limits["high"].max(axis=0)
-    with np.errstate(invalid="ignore"):
-        width = np.where(np.isfinite(low) & np.isfinite(high), high - low, np.inf)
-    return StreamLimits(
-        np.median(other_limits["mean"], axis=0),
-        np.where(np.isfinite(spread), spread, 1.0),
-        low - width,
-        high + width,
-        np.maximum(_most(other_limits["still"], p), _RUN),
-        np.maximum(_most(other_limits["repeated"][:, None], p)[0], _RUN),
-        np.median(other_limits["rest"], axis=0),
-    )
-
-
-def _most(longest: Floats, p: float) -> Floats:
-    """Return half of what other episodes' longest runs, (n, columns), would allow."""
-    # That is the longest of all but the oddest fifth of them, or more where runs vary: half of the
-    # length that has so small a p-value, as the stream allows twice the limit.
-    usual = np.quantile(longest, 1 - ODD_SHARE, axis=0, method="nearest")
-    tails = map(Tail.fit, longest.T)
-    # Where all but a few are alike, the few tell nothing of what is usual.
-    varying = [t.threshold(p) / 2 if t and len(t.estimates) > 1 else 0.0 for t in tails]
-    return np.maximum(usual, varying)
-
-
-def _in_rows(
-    rows: Floats, actions: Floats, stream: Stream, names: Sequence[str]
-) -> list[EpisodeFault]:
-    faults: dict[tuple[str, str], int] = {}
-    for t in stream.through(rows, actions):
-        for key, fault in stream.faults.items():
-            what, since = (key, t) if isinstance(key, str) else (names[key], stream.suspects[key])
-            faults.setdefault((what, fault), since)
-    return [EpisodeFault(*key, row) for key, row in faults.items()]
+    Returns
+    -------
+    scale : StreamScale
+    readings : list of tuple
+        Of each episode, and what is judged of them, as `StreamScale.surprise` takes them.
+    """
+    trajectories = [episode.trajectory for episode in cleaned]
+    base = Baseline.fit(trajectories, baseline) if baseline else None
+    seen = [(x.observations, readings(x.trajectory, base)[1]) for x in cleaned]
+    judged = [rows if judged is None else judged for rows, judged in seen]
+    limits = StreamLimits.fit([rows for rows, _ in seen], judged, ODD_SHARE)
+    return StreamScale.fit(limits, seen, ODD_SHARE), seen
 
 
 def breaks_of(episodes: Sequence[Episode]) -> Floats:

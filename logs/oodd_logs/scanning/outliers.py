@@ -108,6 +108,23 @@ class Tail:
         logs = (-r * math.log1p(amount / mean / r) for mean, r in self.estimates)
         return min(1.0, len(self.estimates) * self.share * math.exp(min(logs)))
 
+    def value(self, surprise: Floats) -> Floats:
+        """Return the statistics with such a ``-log p``, minus infinity up to the median.
+
+        Parameters
+        ----------
+        surprise
+            Of any shape.
+
+        Returns
+        -------
+        float64 array
+        """
+        values = np.full(surprise.shape, -np.inf)
+        for i in np.argwhere(surprise > -math.log(self.share)):
+            values[*i] = self.threshold(math.exp(-surprise[*i]))
+        return values
+
     def threshold(self, p: float) -> float:
         """Return the statistic beyond the median that has a p-value.
 

@@ -1,7 +1,7 @@
 """Find the odd ones among recorded episodes, with their odd rows and sensors.
 
 Each episode is judged by a detector that was fitted on others, and its largest statistic by theirs.
-Faults of the stream, such as gaps and frozen sensors, are looked for by themselves.
+Faults of the stream, such as frozen sensors, count as the statistic that would be as rare.
 """
 
 import itertools
@@ -23,18 +23,27 @@ from oodd_eval.data.bounded import without_nan
 from oodd_eval.data.facts import roles_of
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import ContractError, OoddError, UnknownNameError, UsageError
-from oodd_eval.metrics.alarms import AlarmKind, GuaranteedAlarm, numbered, window_weights
+from oodd_eval.metrics.alarms import AlarmKind, GuaranteedAlarm, joined, numbered, window_weights
 from oodd_eval.metrics.cusum import Standardization
+from oodd_eval.metrics.faults import StreamScale
 from oodd_eval.names import counted
 from oodd_eval.plugins.contract import AnyDetector
 from oodd_eval.plugins.explanations import ExplainingDetector, Explanation, checked_explanation
 from oodd_logs.episodes import Episode
 from oodd_logs.marks import runs_of
-from oodd_logs.scanning.episode_faults import EpisodeFault, breaks_of, clean, gaps, stream_faults
+from oodd_logs.scanning.episode_faults import (
+    CleanedEpisode,
+    EpisodeFault,
+    breaks_of,
+    clean,
+    gaps,
+    stream_scale,
+)
 from oodd_logs.scanning.limits import FITS, SHORTEST, WINDOWS
 from oodd_logs.scanning.outliers import (
     ENOUGH,
     LEAST,
+    ODD_SHARE,
     Tail,
     critical_p,
     q_values,
@@ -65,7 +74,7 @@ class ScannedEpisode:
     threshold
         Of the statistic, which makes an episode odd; NaN where the others are too few.
     odd
-        Whether it is odd, by its q-value or for a fault of the stream.
+        Whether it is odd, by its q-value.
     row, since
         First row with a statistic above the threshold, and the row with which that began as seen
         then; None where the statistic stays below.
@@ -74,7 +83,7 @@ class ScannedEpisode:
     sensors
         Share of each sensor in the evidence at that row, by name, the largest first.
     faults
-        Of the stream.
+        Of the stream: those that would make an episode odd, and gaps, which do not.
     """
 
     episode: Episode
@@ -94,23 +103,21 @@ class ScannedEpisode:
 
     @property
     def first(self) -> int | None:
-        """The first odd row, of the statistic or of a fault; None where there is none."""
-        rows = [self.since, *(fault.row for fault in self.faults)]
-        return min((row for row in rows if row is not None), default=None)
+        """The first odd row; None where there is none."""
+        return self.since
 
     @property
     def alarms(self) -> NDArray[np.bool_]:
-        """True for each odd row, shape (R,): in the intervals, or where a fault began."""
+        """True for each odd row, shape (R,): in the intervals."""
         rows = np.zeros(len(self.scores), dtype=np.bool_)
         for start, stop in self.intervals:
             rows[start:stop] = True
-        rows[[fault.row for fault in self.faults]] = True
         return rows
 
     @property
     def suspects(self) -> list[str]:
         """Names of sensors with a fault, else of those with most evidence, which come first."""
-        faulty = list(dict.fromkeys(f.what for f in self.faults))
+        faulty = list(dict.fromkeys(f.what for f in self.faults if f.fault != "gap"))
         named = [name for name, share in self.sensors.items() if share >= 1 / len(self.sensors)]
         return faulty or named[:3]
 
@@ -203,6 +210,8 @@ class Scan:
 SCANNER: Final = "panel"
 """Detector that scans where none is named."""
 _QUICK: Final = {"forecast": "linear"}  # of it: networks would be fitted 20 times
+
+_FEW: Final = 0.001  # p-value of faults that are shown where episodes are too few to be odd
 
 Outcome = tuple[Floats, Explanation | None]
 """Answer of a detector about one episode: scores, and an explanation if it gives any."""
@@ -297,8 +306,7 @@ def scan_episodes(
             f"windows (--window, window=) of {max(SHORTEST, rows // FITS)} rows, say, or judge it "
             "by a saved watchdog"
         )
-    cleaned, spread = clean(usable)
-    faults = stream_faults(usable, cleaned, spread, names, fdr)
+    cleaned = clean(usable)
     defaults = _QUICK if detector == SCANNER else {}
     trajectories = [episode.trajectory for episode in cleaned]
     arguments = {**defaults, **(parameters or {})}
@@ -316,11 +324,8 @@ def scan_episodes(
     numbers = itertools.chain(*folds)
     outcomes = dict(zip(numbers, itertools.chain(*answers), strict=True))
     scores = [outcomes[i][0] for i in range(len(usable))]
-    judged = []
-    for i, episode in enumerate(usable):
-        statistic = _statistic(handle.alarm, scores, _peers(usable, i), i)
-        answer = scores[i], statistic, outcomes[i][1], faults[i]
-        judged.append(_Judged(episode, *answer, trajectories[i], baseline))
+    judged = _with_faults(usable, cleaned, handle.alarm, scores, baseline)
+    judged = [replace(one, explanation=outcomes[i][1]) for i, one in enumerate(judged)]
     how = "each episode is judged by a fit that has not seen it."
     notes.insert(0, f"{counted(len(usable), 'episode(s)')}, {counted(len(folds), 'fit(s)')}: {how}")
     recordings = len({episode.recording for episode in usable})
@@ -332,6 +337,32 @@ def scan_episodes(
         )
     name = handle.state["name"] or type(handle.detector).__name__
     return _verdict(judged, names, _Terms(f"{name}, fitted on the other episodes", fdr, notes))
+
+
+def _with_faults(
+    episodes: Sequence[Episode],
+    cleaned: Sequence[CleanedEpisode],
+    kind: AlarmKind,
+    scores: Sequence[Floats],
+    baseline: int,
+) -> "list[_Judged]":
+    """Join the statistics of scores and faults of the stream, each scaled on the other episodes."""
+    statistics = [_statistic(kind, scores, _peers(episodes, i), i) for i in range(len(episodes))]
+    largest = np.array([np.nanmax(statistic, initial=-math.inf) for statistic in statistics])
+    scale, read = stream_scale(cleaned, baseline)
+    breaks = breaks_of(episodes)
+    usual = float(np.quantile(breaks, 1 - ODD_SHARE, method="nearest"))
+    judged = []
+    for i, (episode, statistic) in enumerate(zip(episodes, statistics, strict=True)):
+        # Either may take one half of what is odd by chance.
+        surprise = np.maximum(scale.surprise(*read[i]) - math.log(2), 0.0)
+        tail = Tail.fit(*_reference(largest, episodes, i))
+        joint = statistic if tail is None else joined(statistic, tail.value(surprise))
+        readings = _Readings(scale, ~(joint <= statistic), *read[i])
+        pauses = tuple(gaps(episode.time, float(breaks[i]), usual))
+        rest = cleaned[i].trajectory, baseline, readings
+        judged.append(_Judged(episode, scores[i], joint, None, pauses, *rest))
+    return judged
 
 
 def _as_episode(episode: Episode | ArrayLike, number: int) -> Episode:
@@ -388,7 +419,7 @@ def _scan_with(
     breaks = breaks_of(episodes)
     judged = [
         _watched(watchdog.copy(), episode, float(longest), rows.trajectory)
-        for episode, longest, rows in zip(episodes, breaks, clean(episodes)[0], strict=True)
+        for episode, longest, rows in zip(episodes, breaks, clean(episodes), strict=True)
     ]
     notes.insert(
         0, f"{counted(len(episodes), 'episode(s)')}, judged by a watchdog: {watchdog.promise}."
@@ -480,6 +511,23 @@ class _Fit:
         return outcomes
 
 
+class _Readings(NamedTuple):
+    """Readings of an episode, and where their faults are rarer than its score."""
+
+    scale: StreamScale
+    decides: NDArray[np.bool_]
+    rows: NDArray[Any]
+    judged: NDArray[Any] | None
+
+    def faults(self, surprise: float, names: Sequence[str]) -> list[EpisodeFault]:
+        """Return those that are at least as surprising."""
+        named = self.scale.faults(self.rows, self.judged, surprise + math.log(2))
+        return [
+            EpisodeFault(names[d] if d >= 0 else "observation", fault, row)
+            for d, fault, row in named
+        ]
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Judged:
     """One episode with what a detector and the stream say about it."""
@@ -493,6 +541,7 @@ class _Judged:
     faults: tuple[EpisodeFault, ...]
     trajectory: Trajectory
     baseline: int = 0
+    readings: _Readings | None = None
 
     @property
     def evidence(self) -> Floats:
@@ -562,12 +611,12 @@ def _verdict(judged: Sequence[_Judged], names: Sequence[str], terms: _Terms) -> 
     notes, has_p_values = [*terms.notes], fewest >= LEAST
     if not has_p_values:
         p[:] = math.nan
-        deciding = "faults of the stream decide"
+        deciding = "nothing decides"
         if terms.limit > 0:
             deciding = "the watchdog's threshold decides"
         notes.append(
             f"{fewest} episodes are too few to judge one by the others, which takes {LEAST} and "
-            f"works well from {ENOUGH} on: here {deciding} alone. Record more, or cut long ones "
+            f"works well from {ENOUGH} on: here {deciding}. Record more, or cut long ones "
             "(window)."
         )
     elif terms.exact:
@@ -577,6 +626,7 @@ def _verdict(judged: Sequence[_Judged], names: Sequence[str], terms: _Terms) -> 
         )
     q = q_values(p) if has_p_values else p
     critical = critical_p(p, terms.fdr) if has_p_values else math.nan
+    surprising = -math.log(critical if has_p_values else _FEW)
     sums = np.stack([judgement.sums for judgement in judged])
     scanned = []
     for i, judgement in enumerate(judged):
@@ -588,6 +638,9 @@ def _verdict(judged: Sequence[_Judged], names: Sequence[str], terms: _Terms) -> 
         rejected = bool(q[i] <= terms.fdr if has_p_values else largest[i] > terms.limit)
         # Rounding of the threshold may leave nothing but the largest statistic.
         above = runs_of(rejected & (judgement.statistic >= np.fmin(threshold, largest[i])))
+        faults = judgement.faults
+        if judgement.readings is not None:
+            faults = (*judgement.readings.faults(surprising, names), *faults)
         row = since = None
         shares: dict[str, float] = {}
         if rejected:
@@ -595,6 +648,8 @@ def _verdict(judged: Sequence[_Judged], names: Sequence[str], terms: _Terms) -> 
             other_sums = np.delete(sums, i, axis=0).sum(axis=0)
             usual = -math.inf if tail is None else tail.start
             since, values = _blame(judgement, usual, above[0], other_sums)
+            if judgement.readings is not None and judgement.readings.decides[row]:
+                since, values = _faulty(faults, names, row, (since, values))
             order = np.argsort(-values, kind="stable").tolist()
             shares = {names[d]: float(values[d]) for d in order}
         scanned.append(
@@ -607,15 +662,27 @@ def _verdict(judged: Sequence[_Judged], names: Sequence[str], terms: _Terms) -> 
                 float(p[i]),
                 float(q[i]),
                 threshold,
-                rejected or bool(judgement.faults),
+                rejected,
                 row,
                 since,
                 tuple(above),
                 shares,
-                judgement.faults,
+                faults,
             )
         )
     return Scan(scanned, names, terms.judge, terms.fdr, notes)
+
+
+def _faulty(
+    faults: Sequence[EpisodeFault], names: Sequence[str], row: int, blamed: tuple[int, Floats]
+) -> tuple[int, Floats]:
+    """Return since when faults last, and equal shares of faulty sensors; else what is blamed."""
+    causes = [fault for fault in faults if fault.fault != "gap" and fault.row <= row]
+    if not causes:
+        return blamed
+    faulty = np.array([float(name in {fault.what for fault in causes}) for name in names])
+    shares = faulty / faulty.sum() if faulty.any() else blamed[1]
+    return min(fault.row for fault in causes), shares
 
 
 def _peers(episodes: Sequence[Episode], i: int) -> list[int]:
