@@ -508,7 +508,7 @@ class TakesOver(Honest):
         end = time.monotonic() + 2.0
         for channel in channels:
             with contextlib.suppress(Exception):
-                channel.send({"seconds_fit": 0.0, "warm_up": 0, "explains": False})
+                channel.send({"seconds_fit": 0.0, "warm_up": 0, "explains": False, "voices": False})
                 while time.monotonic() < end:
                     if waiting(channel._connection.fileno()):
                         channel.receive()

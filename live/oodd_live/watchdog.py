@@ -34,6 +34,7 @@ from oodd_eval.metrics.faults import ParetoTail, StreamScale, readings
 from oodd_eval.names import check_known, counted
 from oodd_eval.plugins.contract import AnyDetector, StorableDetector, copied
 from oodd_eval.plugins.state import pack, read_state, take, write_state
+from oodd_eval.plugins.voices import VoiceCosts, costs_of_voices
 from oodd_live.handle import DetectorHandle, has_actions, streaming
 from oodd_live.nominal import Episode, Nominal, NominalData
 from oodd_live.reading import EpisodeAlarm, Reading, RunLength
@@ -69,9 +70,13 @@ class Watchdog:
         How rare false alarms are, in words.
     notes
         What was found out about the promise, in sentences: drift, whether calibration is like what
-        is judged.
+        is judged, a voice of the detector that costs the alarm more than a little.
     run_length
         The promised mean time between false alarms with its interval; None with an ``alpha``.
+    voices
+        What the detector's voices find alone and together, on faults injected into calibration
+        episodes (`oodd_eval.plugins.voices.VoiceCosts`); None where it has none, without an
+        ``alpha``, and of a loaded watchdog, whose notes are kept.
     calibration
         What the threshold is from, with the episodes that joined it; None without an ``alpha``.
     raised
@@ -95,6 +100,7 @@ class Watchdog:
         self._tail, self._scale, self._rest = tail, stream, rest
         self._nominal, self.sensors = nominal, list(nominal.sensors)
         self.settings, self.run_length, self.notes = settings, run_length, list(notes)
+        self.voices: VoiceCosts | None = None
         self._live = streaming(handle.detector)
         self._explain_last = getattr(self._live, "explain_last", None)
         commands = rest if handle.actions else ()
@@ -233,7 +239,12 @@ class Watchdog:
                 notes.insert(0, text)
             rule = fitted.rule(alpha, confidence)
             tail = fitted.tail or ParetoTail.fit(fitted.largest)
-            return cls(handle, fitted, rule, tail, stream, rest, nominal, settings, None, notes)
+            watchdog = cls(handle, fitted, rule, tail, stream, rest, nominal, settings, None, notes)
+            visible = (handle.visible(x, nominal.baseline) for x in calibrating)
+            start = rows if handle.adapts else 0
+            watchdog.voices = costs_of_voices(handle.detector, visible, alpha, handle.alarm, start)
+            watchdog.notes += filter(None, [str(watchdog.voices or "")])
+            return watchdog
         rate = settings.rate or 0.0
         rule, tail, length = _with_run_length(scores, faults, handle.alarm, hours, rate)
         return cls(handle, None, rule, tail, stream, rest, nominal, settings, length, notes)

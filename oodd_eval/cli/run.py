@@ -45,7 +45,7 @@ from oodd_eval.prose import print_prose
 from oodd_eval.results.directory import REPORT, ResultsDirectory
 from oodd_eval.results.render import FORMATS
 from oodd_eval.results.report import Report
-from oodd_eval.scoring.doubts import doubts_after, doubts_before
+from oodd_eval.scoring.doubts import costly_voices, doubts_after, doubts_before
 from oodd_eval.scoring.executors import RunSettings
 from oodd_eval.scoring.plan import Plan, make_plan
 from oodd_eval.scoring.runner import RunOutcome
@@ -169,6 +169,8 @@ def run(options: Options) -> int:
     with reporter:
         done = run_plan(plan, split, plugins, settings, results, observers=[reporter, doubts])
     doubts.print(doubts_after(plan, split, results))
+    for sentence in costly_voices(done.records, results):
+        doubts.say(sentence)
     say_notes(results.notes)
     if done.records:
         report = Report(
@@ -225,7 +227,11 @@ class _Doubts:
     def print(self, doubts: Iterable[tuple[str, PromiseFinding]]) -> None:
         """Print a sentence on each environment and finding."""
         for name, finding in doubts:
-            print_prose(f"{name}: {finding}", self._console, "yellow")
+            self.say(f"{name}: {finding}")
+
+    def say(self, sentence: str) -> None:
+        """Print one sentence."""
+        print_prose(sentence, self._console, "yellow")
 
 
 def _options_of(file: str) -> list[str]:

@@ -28,13 +28,14 @@ from oodd_eval.errors import UsageError
 from oodd_eval.metrics.alarms import STATISTICS
 from oodd_eval.metrics.catalogue import NAMES
 from oodd_eval.names import check_known, expression, select
-from oodd_eval.prose import print_sections
+from oodd_eval.prose import print_prose, print_sections
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.evaluate import rescore
 from oodd_eval.results.record import Record
 from oodd_eval.results.render import FORMATS, Format
 from oodd_eval.results.report import Report
 from oodd_eval.results.tables import ROWS
+from oodd_eval.scoring.doubts import costly_voices
 
 _format_options: Final = together(
     *(
@@ -124,6 +125,8 @@ def show(options: Options) -> int:
                 f"split {split.name}, digest {split.digest[:12]}, in {split.path}\n"
             )
     print_sections(report.sections, reporter.console)
+    for sentence in costly_voices(records, results) if options.verbosity >= 0 else ():
+        print_prose(sentence, reporter.console, "yellow")
     if not options.detector:
         reporter.failures(records)
     reporter.console.print(summary(records))

@@ -101,7 +101,9 @@ class Detector(Protocol):
     - ``warm_up``: an int of at most 20, rows at the start that it leaves NaN beyond the horizon;
     - ``reset()`` and ``update(observation, action=None) -> float``: see `StreamingDetector`;
     - ``state()`` and ``restore(state)``: see `StorableDetector`;
-    - ``explain(trajectory)`` and ``explain_last()``: see `oodd_eval.plugins.explanations`.
+    - ``explain(trajectory)`` and ``explain_last()``: see `oodd_eval.plugins.explanations`;
+    - ``voices(trajectory) -> mapping``: where the score is the largest of several statistics, each
+      of these by name, in the score's units: see `oodd_eval.plugins.voices`.
     """
 
     def fit(self, nominal: Sequence[Trajectory]) -> object:

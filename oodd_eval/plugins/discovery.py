@@ -347,10 +347,6 @@ class Plugins:
                     advice = f"uninstall one of them, or leave it out with -p no:{point.name}"
                     raise PluginError(f"detector {spec.name!r} is offered twice, by {by}: {advice}")
                 offers[spec.name] = self._offer(point, spec)
-            for offer in offers.values():
-                if (name := offer.spec.with_actions) and name not in offers:
-                    reason = f"with_actions of {offer.spec.name!r} is {name!r}"
-                    raise PluginError(f"{reason}, expected a detector of the same plug-in")
             self._forms[point.name] = plugin.form
             self._offers |= offers
             self.loaded[point.name] = plugin

@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import ContractError
-from oodd_eval.plugins.contract import Detector, Scores, StreamingDetector
+from oodd_eval.plugins.contract import Detector, StreamingDetector
 
 Named: TypeAlias = NDArray[np.int32]
-"""Sensors named first and onsets by row, shape (2, T + 1); -1 where a row has none."""
+"""The sensor that is named first at a row, and the onset: shape (2,)."""
 
 FLIPPED: Final = 0.05
 """Share of rows in which rounding may turn the sensor named first, or the onset, into another."""
@@ -78,13 +78,10 @@ def explains(detector: object) -> bool:
 
 
 def explain_chunk(detector: Any, chunk: Sequence[Trajectory]) -> list[object]:
-    """Return what is kept of a detector's explanations, after they were checked."""
+    """Return explanations of the last rows of episodes, after all rows were checked."""
     checked = (checked_explanation(detector.explain(episode), episode) for episode in chunk)
     # Of several with the largest share the first one is named.
-    return [
-        np.array([np.where(o < 0, -1, np.nan_to_num(s).argmax(axis=1)), o], dtype=np.int32)
-        for s, o in checked
-    ]
+    return [np.array([np.nan_to_num(s[-1]).argmax(), o[-1]], dtype=np.int32) for s, o in checked]
 
 
 def checked_explanation(returned: Any, trajectory: Trajectory) -> Explanation:
@@ -121,17 +118,14 @@ def checked_explanation(returned: Any, trajectory: Trajectory) -> Explanation:
     return Explanation(shares, onsets)
 
 
-def check_named(array: object, scores: Scores, sensors: int, where: str) -> Named:
-    """Return what came from a worker, if it can explain these scores; else `ContractError`."""
-    rows = len(scores)
-    if not isinstance(array, np.ndarray) or array.dtype != np.int32 or array.shape != (2, rows):
+def check_named(array: object, rows: int, sensors: int, where: str) -> Named:
+    """Return what came from a worker for the last of some rows; else `ContractError`."""
+    if not isinstance(array, np.ndarray) or array.dtype != np.int32 or array.shape != (2,):
         raise ContractError(f"no explanation came back for {where}")
-    valid = ((array >= 0) & (array <= [np.full(rows, sensors - 1), np.arange(rows)])).all(axis=0)
-    fine = np.where(np.isnan(scores), (array == -1).all(axis=0), valid)
-    if not fine.all():
-        t = int(fine.argmin())
+    sensor, onset = array.tolist()
+    if not (0 <= sensor < sensors and 0 <= onset < rows):
         raise ContractError(
-            f"explain names sensor {array[0, t]} and onset {array[1, t]} at t = {t} of {where}, "
-            f"with the score {scores[t]}: expected both where it is defined, and -1 elsewhere"
+            f"explain names sensor {sensor} and onset {onset} at t = {rows - 1} of {where}, where "
+            f"the score is defined: expected one of {sensors} sensors, and a row up to t"
         )
     return array

@@ -1,12 +1,4 @@
-"""The paper's section 3: the anomaly score of any ensemble of forecasters, at any horizon.
-
-A forecaster predicts ``o_t`` from ``o_0 .. o_{t-h}``. What the forecasters of an ensemble predict,
-M samples from each of e members, is compared with what came:
-
-``A_t = 1 / (M e D) * sum_i sum_d |o_{t,d} - f^(i)_{t,d}| / sigma_d``
-
-with sensors standardized by training statistics. Scores are undefined for t < h.
-"""
+"""Sensors standardized by training statistics, as most detectors look at them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -94,28 +86,3 @@ class FeatureScale:
             expected = f"expected ({n},), all finite"
             raise TrajectoryError(f"fitted on {n} sensors and given {actual}: {expected}")
         return row
-
-
-def anomaly_scores(
-    observations: NDArray[np.float32], errors: NDArray[np.float64], horizon: int
-) -> NDArray[np.float64]:
-    """Return scores of one trajectory from the mean absolute errors of its forecasts.
-
-    Parameters
-    ----------
-    observations : float32 array of shape (T + 1, D)
-        Standardized readings of one episode; only their number counts.
-    errors : float64 array of shape (T + 1 - horizon,)
-        Means over samples, members and sensors of ``|o_t - f_t|`` for ``t >= horizon``, in training
-        standard deviations.
-    horizon : int
-        Prediction horizon in steps.
-
-    Returns
-    -------
-    float64 array of shape (T + 1,)
-        NaN for ``t < horizon``.
-    """
-    scores = np.full(len(observations), np.nan)
-    scores[horizon:] = errors
-    return scores

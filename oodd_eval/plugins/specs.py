@@ -134,10 +134,6 @@ def _is_truth(value: object) -> bool:
     return type(value) is bool
 
 
-def _is_amount(value: object) -> bool:
-    return type(value) in (int, float) and _is_bound(value) and value >= 0  # type: ignore[operator]
-
-
 def _declares(parameters: Any) -> bool:
     if parameters is None:
         return True
@@ -161,7 +157,7 @@ FIELDS: Final[tuple[tuple[str, str, Callable[[Any], bool]], ...]] = (
     ("adapts", "'' or baseline", _one_of("", "baseline")),
     ("deterministic other_parameters horizon_decides_fit roles", "True or False", _is_truth),
     ("requires", "names of modules", _are_lines),
-    ("seconds", "a number, 0 or more", _is_amount),
+    ("seconds", "a number, 0 or more", lambda n: type(n) in (int, float) and 0 <= n < math.inf),
     ("version", "a version such as 1.2", _text("[A-Za-z0-9.+!_-]{0,64}")),
     ("parameters", "a dataclass with fields of ASCII names, or None", _declares),
 )

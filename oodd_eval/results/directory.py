@@ -24,7 +24,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import h5py
 import numpy as np
@@ -61,6 +61,10 @@ STREAM: Final = "stream"
 """Dataset of the surprise of the stream by row beside ``scores``."""
 
 
+VOICES: Final = "voices"
+"""Attribute of a score file: what voices cost, as JSON."""
+
+
 @dataclass(frozen=True, slots=True)
 class ScoreFile:
     """Scores of one unit by part (``calibration``, ``test/nominal``, ``test/iid`` and so on).
@@ -70,13 +74,15 @@ class ScoreFile:
     explanations by part, int32 arrays of shape (2, rows) with the sensors named first and the
     onsets, of anomalous parts and detectors that explain only: -1 but at first guaranteed alarms.
     `stream` is the surprise of the stream by part, of episodes without twins only, see
-    `oodd_eval.metrics.faults`.
+    `oodd_eval.metrics.faults`. `voices` is what `oodd_eval.plugins.voices.VoiceCosts` is made of,
+    of detectors that have any.
     """
 
     parts: dict[str, list[NDArray[np.float64]]]
     cost: dict[str, float]
     explained: dict[str, list[NDArray[np.int32]]] = field(default_factory=dict)
     stream: dict[str, list[NDArray[np.float64]]] = field(default_factory=dict)
+    voices: dict[str, Any] = field(default_factory=dict)
 
 
 class _StoredPart(NamedTuple):
@@ -227,6 +233,8 @@ class ResultsDirectory:
         image = io.BytesIO()
         with h5py.File(image, "w") as file:
             file.attrs.update(scores.cost)
+            if voices := scores.voices or self.voices(key):
+                file.attrs[VOICES] = json.dumps(voices)
             for part in sorted(parts):
                 group, (sequences, explained, stream) = file.create_group(part), parts[part]
                 group["offsets"] = np.cumsum([0, *map(len, sequences)], dtype=np.int64)
@@ -281,11 +289,21 @@ class ResultsDirectory:
                         explained[part] = stored.explained
                     if stored.stream is not None:
                         stream[part] = stored.stream
-                cost = {name: float(value) for name, value in file.attrs.items()}
+                attributes = dict(file.attrs)
+                voices = dict(json.loads(attributes.pop(VOICES, "{}")))
+                cost = {name: float(value) for name, value in attributes.items()}
         except Exception:  # noqa: BLE001  h5py raises many kinds for damaged bytes
             return None
         cost = {name: value for name, value in cost.items() if 0 <= value < np.inf}
-        return ScoreFile(parts, cost, explained, stream)
+        return ScoreFile(parts, cost, explained, stream, voices)
+
+    def voices(self, key: str) -> dict[str, Any]:
+        """Return what a score file says of a detector's voices; empty where it says nothing."""
+        try:
+            with self._opened(key) as file:
+                return dict(json.loads(file.attrs[VOICES]))
+        except Exception:  # noqa: BLE001  as above
+            return {}
 
     def _all_parts(self, key: str) -> dict[str, _StoredPart]:
         """Return all parts."""

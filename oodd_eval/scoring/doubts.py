@@ -1,11 +1,14 @@
 """Reasons to trust or doubt promises on a split, before a run and by the scores of one."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
 
 from oodd_eval.data.parts import CALIBRATION, lengths_of
 from oodd_eval.data.split import Split
 from oodd_eval.metrics.promise import PromiseFinding, achieved_share
+from oodd_eval.plugins.voices import VoiceCosts
 from oodd_eval.results.directory import ResultsDirectory
+from oodd_eval.results.record import Record
 from oodd_eval.scoring.plan import Plan
 from oodd_eval.scoring.promises import in_recorded_order, promises_of
 
@@ -61,3 +64,23 @@ def doubts_after(
             finding = achieved_share(calibration, unit.alarm, label, recordings)
             if finding is not None and finding.doubt:
                 yield unit.environment, finding
+
+
+def costly_voices(records: Iterable[Record], results: ResultsDirectory) -> Iterator[str]:
+    """Yield a sentence on each fit of which one voice costs the alarm more than a little.
+
+    Parameters
+    ----------
+    records, results
+        Records of the fits, and where the scores are.
+
+    Yields
+    ------
+    str
+        It begins with the environment and the row.
+    """
+    keys = {r.scores: f"{r.environment}, {r.setting.label(r.seed)}" for r in records if r.ok}
+    for key, label in keys.items():
+        with suppress(LookupError, TypeError, ValueError, AttributeError):  # anybody's file
+            if sentence := str(VoiceCosts.of(results.voices(key))):
+                yield f"{label}: {sentence}"

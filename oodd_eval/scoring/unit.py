@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, islice
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -29,6 +29,7 @@ from oodd_eval.plugins.explanations import Named
 from oodd_eval.plugins.isolation.child import Launcher, Limits, Stop
 from oodd_eval.plugins.isolation.supervisor import Outcome, run_isolated
 from oodd_eval.plugins.state import PackedState
+from oodd_eval.plugins.voices import costs_of_voices, first_rows
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
 from oodd_eval.results.evaluate import first_alarms
 from oodd_eval.results.record import Status
@@ -171,6 +172,10 @@ class GroupedScoring:
         # Metrics with twins alone are of explanations, and there are no baseline rows then.
         self._explains = job.data.paired and not rows and not job.streamed
         self._explained: dict[Member, int] = {}  # rows of each episode that is explained
+        # What voices are compared on, and how.
+        calibration = (Member(CALIBRATION, i) for i in range(sizes[CALIBRATION]))
+        self._heard = first_rows(self._members(calibration))
+        self._hearing: dict[str, Any] = {"kind": job.unit.alarm, "start": self._adapting}
 
     def isolated(
         self, limits: Limits, stop: Stop, *, state: PackedState | None = None, keep: bool = False
@@ -185,12 +190,14 @@ class GroupedScoring:
             "parameters": dict(unit.parameters),
             "baseline": self._adapting,
             "roles": unit.roles,
+            "hearing": self._hearing,
         }
         return run_isolated(
             request,
             self._train,
             map(self._members, self._groups),
             lambda outcome: self._alarmed(outcome.scores, outcome.warm_up),
+            () if self._job.streamed else self._heard,
             limits=limits,
             stop=stop,
             launcher=self._job.launcher,
@@ -211,7 +218,8 @@ class GroupedScoring:
             scores = self._file(outcome.scores, explained, outcome.warm_up)
         except ContractError as error:
             return Scored("invalid", str(error), log=outcome.log)
-        return Scored(file=replace(scores, cost={**cost, "steps_scored": steps}))
+        cost["steps_scored"] = steps
+        return Scored(file=replace(scores, cost=cost, voices=outcome.voices))
 
     def in_process(self) -> Scored:
         """Fit and score in this process, a copy each group; errors of the detector pass through.
@@ -230,7 +238,9 @@ class GroupedScoring:
         explained, warm_up = None, getattr(detector, "warm_up", 0)
         if explanations.explains(detector):
             explained = returned(self._alarmed(scores, warm_up), explanations.explain_chunk)
-        return Scored(file=self._file(scores, explained, warm_up))
+        file = self._file(scores, explained, warm_up)
+        costs = costs_of_voices(self._another(detector), self._heard, **self._hearing)
+        return Scored(file=replace(file, voices=costs.values() if costs else {}))
 
     def _fitted(self) -> contract.Detector:
         """Return a detector that was made and fitted in this process."""
@@ -324,8 +334,7 @@ class GroupedScoring:
             (part, i), rows = member, self._explained[member]
             label = f"{self._job.unit.environment}/{part}[{i}]"
             sensors = len(self._job.data.sensors)
-            checked = explanations.check_named(array, parts[part][i][:rows], sensors, label)
-            named[part][i][:, rows - 1] = checked[:, -1]
+            named[part][i][:, rows - 1] = explanations.check_named(array, rows, sensors, label)
         return ScoreFile(parts, {}, named)
 
     def _checked(

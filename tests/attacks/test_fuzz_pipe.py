@@ -37,7 +37,7 @@ RECORD = Record(
 FLAG = st.booleans() | ANY
 FIT = st.fixed_dictionaries(
     {"seconds_fit": st.floats(0, 9) | ANY, "warm_up": ANY, "explains": FLAG, "updates": FLAG,
-     "forks": FLAG, "state": FLAG}
+     "forks": FLAG, "state": FLAG, "voices": FLAG}
 )  # fmt: skip
 STATE = st.fixed_dictionaries({"names": st.lists(st.text()) | ANY, "text": st.text() | ANY})
 NAMES = st.sampled_from(["status", "reason", "seconds_score", "peak_rss_mb", "seconds_fit",
@@ -65,7 +65,7 @@ def framed(content):
 FRAME = (JSON | saved() | st.binary(max_size=50) | damaged(JSON)).map(framed)
 GOOD = [
     {"seconds_fit": 0.1, "warm_up": 0, "explains": False, "updates": True, "forks": True,
-     "state": True}, {"names": ["x"], "text": "{}"},
+     "state": True, "voices": False}, {"names": ["x"], "text": "{}"},
 ]  # fmt: skip
 PREFIX = b"".join(framed(json.dumps(message).encode()) for message in GOOD)
 TALK = st.lists(FRAME, max_size=6).map(b"".join)

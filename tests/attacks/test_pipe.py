@@ -27,7 +27,7 @@ from oodd_eval.results.record import STATUSES
 ROWS = 30
 GARBLED = "the detector wrote into the pipe between worker and harness"
 FITTED = {"seconds_fit": 0.0, "warm_up": 0, "explains": False, "updates": True, "forks": True,
-          "state": False}  # fmt: skip
+          "state": False, "voices": False}  # fmt: skip
 SCORED = {"seconds_score": 0.0, "peak_rss_mb": 1.0}
 
 WORKER = """

@@ -16,7 +16,7 @@ from oodd_common.windows import LongFitDetector
 from torch import Tensor
 
 from oodd_eval import Trajectory
-from oodd_eval.plugins.forecasting import FeatureScale, anomaly_scores
+from oodd_eval.plugins.forecasting import FeatureScale
 from oodd_eval.plugins.state import Arrays, take
 from oodd_torch.device import resolved_device
 from oodd_torch.forecast import Forecaster
@@ -140,7 +140,7 @@ class NetworkDetector(LongFitDetector):
             batch = order[start : start + BATCH]
             errors = self._forecaster.errors([rows[i] for i in batch])
             for i, error in zip(batch, errors, strict=True):
-                scores[i] = anomaly_scores(rows[i], error, self.horizon)
+                scores[i] = np.concatenate([np.full(self.horizon, np.nan), error])
         return scores
 
     def reset(self) -> None:

@@ -30,6 +30,7 @@ from oodd_eval.plugins.isolation import (
 )
 from oodd_eval.plugins.isolation.child import Child, GivenUpError, Launcher, Limits, Stop
 from oodd_eval.plugins.state import PackedState
+from oodd_eval.plugins.voices import VoiceCosts
 
 _FAILURES: Final = {"error", "oom", "invalid", "incompatible", "unavailable"}
 """The values that a worker reports of itself."""
@@ -41,9 +42,10 @@ class Outcome:
 
     `status` is as in a record, with a reason of one line unless ok. `scores`, `warm_up` and what is
     kept of explanations, if it `explains`, are the detector's own, and checked only for their
-    number and size. `state` is that of the fit, checked, where it was asked for and there is one.
-    Costs are None when the worker ended before they were known; what it told of them is held within
-    what this process knows. `log` is the end of the detector's output.
+    number and size, as are costs of `voices` for their form. `state` is that of the fit, checked,
+    where it was asked for and there is one. Costs are None when the worker ended before they were
+    known; what it told of them is held within what this process knows. `log` is the end of the
+    detector's output.
     """
 
     status: str = "ok"
@@ -51,6 +53,7 @@ class Outcome:
     scores: list[object] = field(default_factory=list)
     explains: bool = False
     explained: list[object] = field(default_factory=list)
+    voices: dict[str, Any] = field(default_factory=dict)
     warm_up: object = 0
     state: PackedState | None = None
     seconds_fit: float | None = None
@@ -68,6 +71,7 @@ def run_isolated(
     train: Sequence[Trajectory],
     groups: Iterable[Iterable[Trajectory]],
     explained: Explained | None = None,
+    heard: Iterable[Trajectory] = (),
     *,
     limits: Limits,
     stop: Stop,
@@ -82,12 +86,14 @@ def run_isolated(
     A group's process is a fork of the fitted one. Where there can be none, as threads run on after
     the fit or a launcher starts each process, it is a fresh one, which takes over the state of the
     fit; with a launcher, a detector without a state is fitted again in each. A detector that
-    explains is asked to explain the groups that `explained` returns in the same way, last.
+    explains is asked to explain the groups that `explained` returns in the same way, and one with
+    voices for what these cost on the nominal episodes `heard`, last.
 
     The request names ``plugin`` and ``detector``, its ``parameters``, ``seed``, ``horizon`` and
-    perhaps ``baseline`` and ``roles`` (see `make_detector`). `state` is that of an earlier fit,
-    which replaces fitting; with `keep`, the outcome has that of this one. `streamed` hands over one
-    row of each episode at a time, and waits for the scores before the next.
+    perhaps ``baseline`` and ``roles`` (see `make_detector`) and ``hearing`` (`costs_of_voices`).
+    `state` is that of an earlier fit, which replaces fitting; with `keep`, the outcome has that of
+    this one. `streamed` hands over one row of each episode at a time, and waits for the scores
+    before the next.
     `progress` is called with the share of the fit that is done, as far as the detector tells, and
     with 1 at its end.
 
@@ -97,7 +103,7 @@ def run_isolated(
     """
     unit = _UnitRun(request, train, limits, stop, launcher, state, keep, streamed, progress)
     try:
-        unit.run(groups, explained)
+        unit.run(groups, explained, heard)
     except GivenUpError as error:
         unit.outcome.status, unit.outcome.reason = error.status, error.reason
     return unit.outcome
@@ -121,9 +127,15 @@ class _UnitRun:
     seconds: float = 0.0
     peak: float = 0.0
     updates: bool = False
+    voices: bool = False
     streams: int = CHUNK
 
-    def run(self, groups: Iterable[Iterable[Trajectory]], explained: Explained | None) -> None:
+    def run(
+        self,
+        groups: Iterable[Iterable[Trajectory]],
+        explained: Explained | None,
+        heard: Iterable[Trajectory],
+    ) -> None:
         """Fit and score; `GivenUpError` for any failure."""
         with ExitStack() as stack:
             fitted = None
@@ -139,11 +151,14 @@ class _UnitRun:
             if explained and self.outcome.explains:
                 for group in explained(self.outcome):
                     self._group(fitted, group, "explain")
+            if self.voices and heard:
+                self._group(fitted, heard, "hear")
         self.outcome.seconds_score = min(self.seconds, time.monotonic() - self.start)
         self.outcome.peak_rss_mb = self.peak
 
     def _group(self, fitted: Child | None, group: Iterable[Trajectory], order: str) -> None:
-        """Have a process of its own score, or explain, a group."""
+        """Have a process of its own score, explain or hear a group."""
+        work = {"stream": self._stream, "hear": self._hear}.get(order, self._score)
         with ExitStack() as stack:
             if fitted:
                 channel = stack.enter_context(closing(fitted.fork()))
@@ -151,7 +166,7 @@ class _UnitRun:
                 child = stack.enter_context(self._process())
                 self._fit(child, forks=False)
                 channel = child.channel
-            (self._stream if order == "stream" else self._score)(channel, group, order)
+            work(channel, group, order)
 
     @contextmanager
     def _process(self) -> Iterator[Child]:
@@ -199,8 +214,9 @@ class _UnitRun:
         self.progress(1.0)
         outcome.seconds_fit = seconds if outcome.seconds_fit is None else outcome.seconds_fit
         outcome.warm_up = _value(message, "warm_up", object)
-        outcome.explains, self.updates, can_fork, follows = (
-            _value(message, name, bool) for name in ("explains", "updates", "forks", "state")
+        outcome.explains, self.updates, can_fork, follows, self.voices = (
+            _value(message, name, bool)
+            for name in ("explains", "updates", "forks", "state", "voices")
         )
         if follows:
             outcome.state = self.state = channel.receive_state()
@@ -225,6 +241,15 @@ class _UnitRun:
             for trajectory in chunk:
                 most = HEADER_BYTES + ROW_BYTES * len(trajectory)
                 arrays.append(channel.receive_array(most))
+
+    def _hear(self, channel: Channel, group: Iterable[Trajectory], order: str) -> None:
+        episodes = [*group]
+        with suppress(ConnectionError):
+            channel.send({order: len(episodes), **self.request["hearing"]})
+            for trajectory in episodes:
+                channel.send_trajectory(trajectory)
+        if costs := _value(_receive(channel), "costs", dict):
+            self.outcome.voices = VoiceCosts.of(costs).values()
 
     def _stream(self, channel: Channel, group: Iterable[Trajectory], order: str) -> None:
         """Send episodes in lockstep: a row of each, and the next ones when all scores are there."""

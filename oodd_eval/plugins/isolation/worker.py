@@ -3,9 +3,9 @@
 It never holds onsets, anomalies, twins' pairing or the name of the environment. It makes the
 detector, which learns from training trajectories or takes over a state, and then does what it is
 ordered over its channel, until that ends: score or explain some trajectories, score rows one by
-one, or fork. Every fork has a channel of its own, gets one group and ends with it, so nothing that
-an honest detector remembers of a group reaches the next one, and two episodes with the same seed,
-which agree bit for bit before the onset, never meet.
+one, tell what its voices cost, or fork. Every fork has a channel of its own, gets one group and
+ends with it, so nothing that an honest detector remembers of a group reaches the next one, and two
+episodes with the same seed, which agree bit for bit before the onset, never meet.
 
 Messages have a descriptor of their own, so that nothing that a detector prints gets between them.
 """
@@ -62,6 +62,7 @@ from oodd_eval.plugins.isolation import (
     process_control,
 )
 from oodd_eval.plugins.state import PackedState, pack
+from oodd_eval.plugins.voices import VoicedDetector, costs_of_voices
 
 _STATUSES: Final[dict[type[BaseException], str]] = {
     MemoryError: "oom",
@@ -150,6 +151,7 @@ def serve(channel: Channel, packages: Sequence[Path] = ()) -> None:
             "seconds_fit": seconds,
             "warm_up": getattr(detector, "warm_up", 0),
             "explains": explains(detector),
+            "voices": isinstance(detector, VoicedDetector),
             "updates": isinstance(detector, StreamingDetector),
             "forks": forks,
             "state": state is not None,
@@ -174,6 +176,10 @@ def _obey(channel: Channel, detector: Detector) -> None:
                 _fork(channel, detector)
             elif "stream" in order:
                 _score_rows(channel, detector, **order)
+            elif "hear" in order:
+                episodes = [channel.receive_trajectory() for _ in range(order.pop("hear"))]
+                costs = costs_of_voices(detector, episodes, **order)
+                channel.send({"costs": costs.values() if costs else {}})
             else:
                 _score(channel, detector, **order)
     _end_children()
