@@ -33,6 +33,8 @@ Of 20 episodes of 150 rows one that was left out had four times the largest stat
 """
 CHARTED_ROWS: Final = 2500
 """Least transitions from which it is fitted."""
+MOST_ROWS: Final = 200_000
+"""Most rows, about, from which it is fitted, of evenly spread episodes: bounds time and memory."""
 NOISY: Final = 0.2
 """Least share of sensors whose errors are noise, for charts: a linear forecast says all there is.
 
@@ -372,6 +374,7 @@ class ConstantsVoice(Voice):
         rows = sum(len(x.rows) - h for x in long)
         if len(long) < CHARTED_EPISODES or rows < CHARTED_ROWS or panel.basis_.size:
             return []
+        long = long[:: min(-(-rows // MOST_ROWS), len(long) // CHARTED_EPISODES)]
         rank = chosen_rank(long, h, panel.learnt) if panel.varies_ else 0
         charts: list[Floats] = []
         for i in range(FOLDS):

@@ -410,13 +410,15 @@ class PanelDetector(LongFitDetector):
         )
         total = sum(len(rows) for rows, _ in episodes)
         step = -(-total // SAMPLE)
-        parts = [self._steps(*x, forecast) for x in episodes]
-        members: list[PanelMember] = []
-        for kind in MEMBERS:
-            member = kind()
-            seen = np.concatenate([member.features(f)[::step] for f in parts])
-            member.fit(seen)
-            members.append(member)
+        members: list[PanelMember] = [kind() for kind in MEMBERS]
+        seen: list[list[Floats]] = [[] for _ in MEMBERS]
+        for x in episodes:
+            features = self._steps(*x, forecast)
+            for parts, member in zip(seen, members, strict=True):
+                # A copy of some rows: the others need not stay in memory.
+                parts.append(member.features(features)[::step].copy())
+        for parts, member in zip(seen, members, strict=True):
+            member.fit(np.concatenate(parts))
         return forecast, members
 
     def _varies(self, episodes: Sequence[tuple[Floats, StandardEpisode]], ridge: float) -> bool:
