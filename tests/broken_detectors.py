@@ -23,7 +23,7 @@ class Good:
     Whole numbers, so that messages do not depend on the last digit of a computation.
     """
 
-    def __init__(self, *, seed=0, horizon=1, power=1.0, baseline=0):
+    def __init__(self, *, seed=0, horizon=1, power=1.0, baseline=0, roles=()):
         self.seed, self.horizon, self.power, self.baseline = seed, horizon, power, baseline
         self.std_ = None
 
@@ -93,6 +93,7 @@ GOOD = DetectorSpec(
     parameters=declared_by({"power": 1.0}),
     horizon_decides_fit=False,
     adapts="baseline",
+    roles=True,
 )
 
 
@@ -479,13 +480,14 @@ class HandsOverInVain(Good):
 
 @breaks("baseline", "scores with baseline=21 are those without it")
 class LearnsNothingFromIt(Good):
-    def __init__(self, *, seed=0, horizon=1, power=1.0, baseline=0):
+    def __init__(self, *, seed=0, horizon=1, power=1.0, baseline=0, roles=()):
         super().__init__(seed=seed, horizon=horizon, power=power)
 
 
-@breaks("roles", "unexpected keyword argument 'roles'", roles=True)
+@breaks("roles", "unexpected keyword argument 'roles'")
 class TakesNoRoles(Good):
-    pass
+    def __init__(self, *, seed=0, horizon=1, power=1.0, baseline=0):
+        super().__init__(seed=seed, horizon=horizon, power=power, baseline=baseline)
 
 
 @breaks("shared-fit", "a fit of horizon 1, restored for horizon 3, differs from a")
