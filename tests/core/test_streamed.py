@@ -93,7 +93,7 @@ def run_rows(detector, split, output=None, *, streamed=True, **parameters):
 
 QUICK = [(name, {}) for name in ("mewma", "persistence", "clock", "random")]
 OTHERS = [
-    *((name, {}) for name in ("mahalanobis", "range", "comb", "pca", "knn", "deedee")),
+    *((name, {}) for name in ("mahalanobis", "range", "comb", "pca", "knn", "deedee", "arcade-a")),
     *((name, {}) for name in ("manifold", "panel", "oracle-gym")),
     *((name, {"trees": 3}) for name in ("rf", "rf-ewma")),
     *((name, {"updates": 3}) for name in ("pe", "pe-a", "npn", "riqn", "riqn-ms", "rnd", "paano")),

@@ -119,6 +119,8 @@ class Arcade(NetworkRival):
         w = self.weights_
         errors = (row - inputs @ w["forecast"]) / w["unit"]
         charts = heads(features(inputs[None], len(row), self.window), errors)
+        if not charts.any():  # the first rows, which nothing is known of
+            return self.surprise_ if moved else 0.0
         charts = (np.log(np.maximum(charts, SMALLEST)) - w["typical"]) / w["calibration"]
         largest = charts.max(initial=-LARGEST)
         return float(max(largest, self.surprise_) if moved else largest)
@@ -272,7 +274,8 @@ class Heads:
         total = self._noise + self._seen @ self._covariance @ self._seen
         total = total + 1e-6 * np.eye(total.shape[-1])
         moved = np.linalg.solve(total, self._slope[..., None])[..., 0]
-        return np.sqrt(np.maximum((self._slope * moved).sum(axis=3), 0.0))
+        evidence: Floats = np.sqrt(np.maximum((self._slope * moved).sum(axis=3), 0.0))
+        return evidence
 
 
 def features(inputs: Floats, sensors: int, lags: int) -> Floats:
@@ -332,7 +335,8 @@ def _ridge(
     def solved(gram: Floats, cross: Floats) -> Floats:
         values, vectors = np.linalg.eigh(gram)
         values = np.maximum(values, 0.0)[:, None] + PENALTIES[:, None, None] * rows
-        return vectors @ ((vectors.T @ cross) / values)
+        coefficients: Floats = vectors @ ((vectors.T @ cross) / values)
+        return coefficients
 
     errors = np.zeros((len(PENALTIES), crosses.shape[2]))
     for i, gram in enumerate(grams):
