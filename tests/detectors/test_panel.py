@@ -5,6 +5,7 @@ from functools import partial
 import numpy as np
 import oodd_panel.voices
 import pytest
+from oodd_common.windows import StandardEpisode, regressors
 from oodd_panel import make_panel
 from oodd_panel.constants import (
     LAGS,
@@ -17,13 +18,7 @@ from oodd_panel.constants import (
     share_of_noise,
 )
 from oodd_panel.detector import PanelDetector
-from oodd_panel.forecast import (
-    EpisodeLearner,
-    LinearForecast,
-    StandardEpisode,
-    chosen_ridge,
-    regressors,
-)
+from oodd_panel.forecast import EpisodeLearner, LinearForecast, chosen_ridge
 from oodd_panel.learning import FAULTS, ONSET, shows_no_loss, with_fault
 from oodd_panel.members import (
     ENERGY,
@@ -88,9 +83,9 @@ def panel():
 def test_regressors_hold_three_rows_and_three_actions_newest_first_then_one():
     rows, actions = np.array([[1.0], [2.0], [3.0], [4.0]]), np.array([[10.0], [20.0], [30.0]])
     expected = [[1, 1, 1, 10, 0, 0, 1], [2, 1, 1, 20, 10, 0, 1], [3, 2, 1, 30, 20, 10, 1]]
-    assert regressors(StandardEpisode(rows, actions), 1).tolist() == expected
-    assert regressors(StandardEpisode(rows, actions), 2).tolist() == expected[:2]
-    assert regressors(StandardEpisode(rows[:1], actions[:0]), 1).shape == (0, 7)
+    assert regressors(StandardEpisode(rows, actions), 1, order=3).tolist() == expected
+    assert regressors(StandardEpisode(rows, actions), 2, order=3).tolist() == expected[:2]
+    assert regressors(StandardEpisode(rows[:1], actions[:0]), 1, order=3).shape == (0, 7)
 
 
 def test_learnt_coefficients_are_the_posterior_mean_of_bayesian_regression():

@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -249,3 +249,32 @@ class LongFitDetector(StorableWindowDetector):
         """Learn from nominal trajectories, see `WindowDetector.fit`, and tell `progress`."""
         self.progress = progress or ignore_progress
         return super().fit(nominal)
+
+
+class StandardEpisode(NamedTuple):
+    """Standardized rows (T + 1, D) and actions (T, A) of an episode; A may be 0."""
+
+    rows: Scores
+    actions: Scores
+
+
+def regressors(episode: StandardEpisode, horizon: int, order: int) -> Scores:
+    """Return what the forecasts of rows h, ..., T use, (T + 1 - h, K).
+
+    The latest `order` rows of sensors and of actions, newest first, with the first observation
+    repeated and no action (0, the mean) before the beginning; then 1.
+
+    Examples
+    --------
+    >>> episode = StandardEpisode(np.array([[1.0], [2.0], [3.0]]), np.empty((2, 0)))
+    >>> regressors(episode, 1, order=2).tolist()
+    [[1.0, 1.0, 1.0], [2.0, 1.0, 1.0]]
+    """
+    rows, actions = episode
+    n = max(len(rows) - horizon, 0)
+    lags = np.arange(n)[:, None] - np.arange(order)
+    parts = [rows[np.maximum(lags, 0)].reshape(n, order * rows.shape[1])]
+    if actions.shape[1]:
+        known = np.where(lags[..., None] >= 0, actions[np.maximum(lags, 0)], 0.0)
+        parts.append(known.reshape(n, order * actions.shape[1]))
+    return np.concatenate([*parts, np.ones((n, 1))], axis=1)

@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from oodd_common.charts import Floats, Smoother, limited, product
+from oodd_common.windows import StandardEpisode, regressors
 
 from oodd_eval import Trajectory
 from oodd_eval.plugins.state import State, take
-from oodd_panel.forecast import ROWS, StandardEpisode, regressors
+from oodd_panel.forecast import ROWS
 from oodd_panel.voices import CHARTS, Voice
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 from oodd_common.charts import Floats, limited, product
-from oodd_common.windows import LongFitDetector
+from oodd_common.windows import LongFitDetector, StandardEpisode, regressors
 
 from oodd_eval import Explanation, Trajectory
 from oodd_eval.data.baseline import Baseline, Shift
@@ -24,15 +24,7 @@ from oodd_eval.plugins.forecasting import CONSTANT, FeatureScale
 from oodd_eval.plugins.state import Arrays, State, take
 from oodd_panel import PanelParameters, learning
 from oodd_panel.constants import FOLDS, LAGS, ConstantsVoice
-from oodd_panel.forecast import (
-    ORDER,
-    ROWS,
-    EpisodeLearner,
-    LinearForecast,
-    StandardEpisode,
-    chosen_ridge,
-    regressors,
-)
+from oodd_panel.forecast import ORDER, ROWS, EpisodeLearner, LinearForecast, chosen_ridge
 from oodd_panel.frame import FrameVoice
 from oodd_panel.members import MEMBERS, Features, Latest, PanelMember, Pattern, window_of
 from oodd_panel.surprise import SurpriseScale
@@ -259,7 +251,7 @@ class PanelDetector(LongFitDetector):
         h = self.horizon
         learner = EpisodeLearner(forecast, self.learnt)
         levels = episode.rows[h:]
-        errors = learner(regressors(episode, h), levels)
+        errors = learner(regressors(episode, h, ORDER), levels)
         return Latest(levels.shape[1], window_of(rows.shape[1]), rows[0])(rows[h:], errors)
 
     def _judge(self, window: NDArray[Any], now: NDArray[Any], _t: int) -> float:

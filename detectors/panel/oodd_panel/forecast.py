@@ -13,6 +13,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from oodd_common.charts import Floats, limited, product
+from oodd_common.windows import StandardEpisode, regressors
 
 ORDER: Final = 3
 """Latest observations, and actions, that a forecast uses."""
@@ -30,34 +31,6 @@ ROWS: Final = 8
 """Rows that are multiplied by a matrix at once: few, as a stream pays for all of them."""
 
 
-class StandardEpisode(NamedTuple):
-    """Standardized rows (T + 1, D) and actions (T, A) of an episode; A may be 0."""
-
-    rows: Floats
-    actions: Floats
-
-
-def regressors(episode: StandardEpisode, horizon: int, order: int = ORDER) -> Floats:
-    """Return what the forecasts of rows h, ..., T use, (T + 1 - h, K).
-
-    The latest `order` rows of sensors and of actions, newest first, with the first observation
-    repeated and no action (0, the mean) before the beginning; then 1.
-
-    Examples
-    --------
-    >>> regressors(StandardEpisode(np.array([[1.0], [2.0], [3.0]]), np.empty((2, 0))), 1).tolist()
-    [[1.0, 1.0, 1.0, 1.0], [2.0, 1.0, 1.0, 1.0]]
-    """
-    rows, actions = episode
-    n = max(len(rows) - horizon, 0)
-    lags = np.arange(n)[:, None] - np.arange(order)
-    parts = [rows[np.maximum(lags, 0)].reshape(n, order * rows.shape[1])]
-    if actions.shape[1]:
-        known = np.where(lags[..., None] >= 0, actions[np.maximum(lags, 0)], 0.0)
-        parts.append(known.reshape(n, order * actions.shape[1]))
-    return np.concatenate([*parts, np.ones((n, 1))], axis=1)
-
-
 class _Moments(NamedTuple):
     gram: Floats  # (K, K)
     cross: Floats  # (K, D)
@@ -66,7 +39,7 @@ class _Moments(NamedTuple):
 
     @classmethod
     def of(cls, episode: StandardEpisode, horizon: int) -> _Moments:
-        x, y = regressors(episode, horizon), episode.rows[horizon:]
+        x, y = regressors(episode, horizon, ORDER), episode.rows[horizon:]
         return cls(x.T @ x, x.T @ y, y.T @ y, len(x))
 
 
@@ -92,7 +65,7 @@ def chosen_ridge(folds: Sequence[Sequence[StandardEpisode]], horizon: int) -> fl
         rest = _total([m for j, fold_moments in enumerate(moments) if j != i for m in fold_moments])
         solved = [_solve(rest, ridge) for ridge in RIDGES]
         for x in fold:
-            regressed = regressors(x, horizon)
+            regressed = regressors(x, horizon, ORDER)
             for r, coefficients in enumerate(solved):
                 error = np.clip(x.rows[horizon:] - regressed @ coefficients, -WILD, WILD)
                 errors[r] += (error**2).sum()

@@ -12,9 +12,10 @@ from typing import Final, TypeAlias
 
 import numpy as np
 from oodd_common.charts import Floats, limited
+from oodd_common.windows import StandardEpisode, regressors
 
 from oodd_eval.metrics.auc import auc
-from oodd_panel.forecast import WILD, EpisodeLearner, LinearForecast, StandardEpisode, regressors
+from oodd_panel.forecast import ORDER, WILD, EpisodeLearner, LinearForecast
 
 ONSET: Final = 15
 """Row from which a fault is put into a nominal episode."""
@@ -51,7 +52,7 @@ def gain(episodes: Sequence[StandardEpisode], horizon: int, ridge: float, learnt
             forecast = LinearForecast.fit(episodes[1 - part :: 2], horizon, ridge, varies=varies)
             for episode in episodes[part::2]:
                 learner = EpisodeLearner(forecast, learnt)
-                x, y = regressors(episode, horizon), episode.rows[horizon:]
+                x, y = regressors(episode, horizon, ORDER), episode.rows[horizon:]
                 learner(x[:learnt], y[:learnt])
                 errors = y[learnt:] - x[learnt:] @ learner.coefficients
                 squares.append((limited(errors, WILD) ** 2).mean(axis=0))

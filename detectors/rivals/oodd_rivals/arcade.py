@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from oodd_common.charts import Floats
-from oodd_panel.forecast import StandardEpisode, regressors
+from oodd_common.windows import StandardEpisode, regressors
 
 from oodd_eval import Trajectory
 from oodd_eval.errors import TrajectoryError
