@@ -563,9 +563,9 @@ def test_as_many_rows_of_an_episode_are_learnt_as_asked_for(learn, baseline, row
     x = driven(300, 0.6)
     learner = EpisodeLearner(panel.forecast_, panel.learnt)
     episode = panel.standardized(x)
-    learner(regressors(episode, 1)[:rows], episode.rows[1 : 1 + rows])
+    learner(regressors(episode, 1, order=3)[:rows], episode.rows[1 : 1 + rows])
     before = learner.coefficients
-    learner(regressors(episode, 1)[rows:], episode.rows[1 + rows :])
+    learner(regressors(episode, 1, order=3)[rows:], episode.rows[1 + rows :])
     assert learner.coefficients is before
     assert np.array_equal(before, panel.forecast_.coefficients) == (rows == 0)
 
