@@ -32,7 +32,6 @@ from oodd_panel.members import (
     RecentRows,
     Sums,
 )
-from oodd_panel.surprise import SurpriseScale
 from oodd_panel.voices import Voice, VoiceScale
 from oodd_pe import make_pe
 from sklearn.decomposition import PCA
@@ -321,37 +320,6 @@ def test_neighbours_are_those_of_a_brute_search():
     search = NearestNeighbors(n_neighbors=5).fit(nominal)
     np.testing.assert_allclose(member.lengths(seen), search.kneighbors(seen)[0].mean(axis=1))
     np.testing.assert_allclose(member.lengths(seen), member.differences(seen)[0])
-
-
-# Tails
-
-
-def test_surprises_of_fresh_nominal_values_are_exponential():
-    rng = np.random.default_rng(9)
-    tail, clean, spoiled = SurpriseScale(), SurpriseScale(), SurpriseScale()
-    tail.fit(rng.exponential(size=20_000))
-    surprises = tail(rng.exponential(size=20_000))
-    # Of a uniform p-value: mean 1, and one in a hundred beyond log 100.
-    assert surprises.mean() == pytest.approx(1.0, abs=0.05)
-    assert (surprises > np.log(20)).mean() == pytest.approx(0.05, abs=0.01)
-    # The tail of quantiles is continued, and few odd values do not move it.
-    clean.fit(-np.log(1 - (np.arange(100_000) + 0.5) / 100_000))
-    assert float(clean.scale_) == pytest.approx(1.0, abs=0.01)
-    np.testing.assert_allclose(clean(np.array([1.0, 5.0, 50.0])), [1.0, 5.0, 50.0], rtol=0.02)
-    spoiled.fit(np.r_[rng.exponential(size=2000), np.full(20, 1e4)])
-    assert float(spoiled.scale_) == pytest.approx(1.0, rel=0.25)
-
-
-def test_a_tail_of_few_values_is_drawn_to_the_common_scale():
-    few, many = SurpriseScale(), SurpriseScale()
-    rng = np.random.default_rng(10)
-    few.fit(rng.exponential(size=100))
-    many.fit(rng.exponential(size=100_000))
-    few_alone, many_alone = few.relative(), many.relative()
-    for scale in (few, many):
-        scale.draw(2.0)
-    assert few.relative() == pytest.approx(few_alone ** (10 / 210) * 2.0 ** (200 / 210))
-    assert many.relative() == pytest.approx(many_alone, rel=0.05)
 
 
 # Voices

@@ -27,7 +27,6 @@ from oodd_panel.constants import FOLDS, LAGS, ConstantsVoice
 from oodd_panel.forecast import ORDER, ROWS, EpisodeLearner, LinearForecast, chosen_ridge
 from oodd_panel.frame import FrameVoice
 from oodd_panel.members import MEMBERS, Features, Latest, PanelMember, Pattern, window_of
-from oodd_panel.surprise import SurpriseScale
 from oodd_panel.voices import MEMBERS_VOICE, EnsembleVoice, Voice, VoiceScale
 
 LIMIT: Final = 30.0
@@ -105,7 +104,7 @@ class PanelDetector(LongFitDetector):
         super().__init__(name, seed=seed, horizon=horizon, window=LAGS, actions=actions)
         self.parameters = parameters
         self.members_: list[PanelMember] = [member() for member in MEMBERS]
-        self.tails_ = [SurpriseScale() for _ in MEMBERS]
+        self.tails_ = [VoiceScale() for _ in MEMBERS]
         self.voices_: dict[str, Voice] = {}
         self.scales_: dict[str, VoiceScale] = {}
 
@@ -370,12 +369,7 @@ class PanelDetector(LongFitDetector):
             forecast, members = self._fitted(others, ridge, varies=varies)
             for fold_rows, episode in fold:
                 lengths.append(self._lengths(forecast, members, fold_rows, episode))
-        for tail, values in zip(self.tails_, np.concatenate(lengths).T, strict=True):
-            tail.fit(values)
-        # A tenth of few rows, which resemble one another, say little about a tail.
-        common = float(np.exp(np.mean([np.log(tail.relative()) for tail in self.tails_])))
-        for tail in self.tails_:
-            tail.draw(common)
+        self.tails_ = _tails(lengths)
         statistics = [_combined(self._surprised(x)) for x in lengths]
         self.forecast_, self.members_ = self._fitted(
             list(zip(rows, episodes, strict=True)), ridge, varies=varies
@@ -441,10 +435,7 @@ class PanelDetector(LongFitDetector):
             left = episodes[part::2][: learning.EPISODES // 2]
             left = [(rows[: 2 * self.learnt], episode) for rows, episode in left]
             judged = partial(self._lengths, forecast, members)
-            of_nominal = np.concatenate([judged(*x) for x in left])
-            tails = [SurpriseScale() for _ in members]
-            for tail, values in zip(tails, of_nominal.T, strict=True):
-                tail.fit(values)
+            tails = _tails([judged(*x) for x in left])
             scale = forecast.scale
             if self.basis_.size:
                 scale = np.full(left[0][0].shape[1], float(scale.mean()))
@@ -542,9 +533,15 @@ def _part(state: State, prefix: str) -> dict[str, Any]:
     return {n.removeprefix(prefix): a for n, a in state.items() if n.startswith(prefix)}
 
 
+def _tails(lengths: Sequence[Floats]) -> list[VoiceScale]:
+    """Return each member's scale, from the members' lengths in nominal episodes, (N, K) each."""
+    by_member = zip(*(x.T for x in lengths), strict=True)
+    return [VoiceScale().fit(of_member) for of_member in by_member]
+
+
 def _statistic(
     judged: Callable[[Floats, StandardEpisode], Floats],
-    tails: Sequence[SurpriseScale],
+    tails: Sequence[VoiceScale],
     rows: Floats,
     episode: StandardEpisode,
 ) -> Floats:
