@@ -11,8 +11,10 @@ from oodd_pe.ensemble import BLOCK, DensityEnsemble
 from oodd_pe.forecaster import Transitions
 from oodd_pe.network import LEAST_SCALES, DensityNetworks, rounds, train
 from oodd_pe.rare import COUNTS, LARGEST, STEEP, Leaks, RareEvents, Regions, Tails
+from oodd_pe.rare import NOMINAL as NOMINAL_SUM
 from oodd_pe.statistic import RETURN, Charts, Evidence, Onsets, Running, deviance
 from scipy import stats
+from scipy.signal import lfilter
 from sklearn.tree import DecisionTreeRegressor
 
 from oodd_eval import Trajectory
@@ -406,6 +408,25 @@ def test_leaky_sums_by_hand():
     squeezed = STEEP * (1 + math.log(2.0 / STEEP))
     np.testing.assert_allclose(leaks(np.array([2.0, 4.0])), [[1.0, squeezed], [0.25, 1.2]])
     np.testing.assert_allclose(leaks(np.array([0.0])), [[0.5], [1.055]])
+
+
+def test_a_unit_is_how_far_the_sums_of_an_episode_get():
+    # Every tenth episode has runs of steps that count: sums of many units.
+    episodes = [
+        (
+            inputs,
+            residuals * np.where(np.arange(500) % 100 < 5 * (seed % 10 == 0), 9, 1)[:, None],
+            shares,
+        )
+        for seed, (inputs, residuals, shares) in enumerate(map(landing, range(20)))
+    ]
+    events = RareEvents([0.1, 0.01])
+    events.fit(*zip(*episodes, strict=True))
+    counts = [events.counts(*episode) for episode in episodes]
+    largest = [[lfilter([1], [1, w - 1], c).max() for w in events.memories] for c in counts]
+    reached = np.mean(largest, axis=0) + np.std(largest, axis=0) - NOMINAL_SUM
+    assert (reached > 2 * STEEP).all()
+    np.testing.assert_allclose(events.excess_, reached)
 
 
 def test_leaky_sums_come_down_when_a_fault_has_ended(events):

@@ -203,7 +203,7 @@ class RareEvents:
         ones = np.ones(len(self.memories))
         episodes = zip(inputs, residuals, shares, strict=True)
         counts = [self.counts(*episode) for episode in episodes]
-        largest = [Leaks(self.memories, ones, ones * np.inf)(c).max(axis=1) for c in counts]
+        largest = [Leaks(self.memories, ones, ones * np.inf).units(c).max(axis=1) for c in counts]
         # A single step is never more than what is usual for the largest sum of an episode.
         usual = np.mean(largest, axis=0) + np.std(largest, axis=0)
         self.excess_ = np.maximum(usual, LARGEST - NOMINAL)
@@ -272,12 +272,16 @@ class Leaks:
         self._sums = [0.0] * len(self._keep)
 
     def __call__(self, counts: Floats) -> Floats:
-        """Return the sums after each of the next N steps, 1 where they are usual: (W, N)."""
+        """Return the chart after each of the next N steps, 1 where sums are usual: (W, N)."""
+        units = self.units(counts)
+        beyond = np.maximum(units, STEEP)
+        return np.minimum(units, STEEP + STEEP * np.log(beyond / STEEP))
+
+    def units(self, counts: Floats) -> Floats:
+        """Return the sums after each of the next N steps, in units of usual ones: (W, N)."""
         sums = np.empty((len(self._keep), len(counts)))
         for t, count in enumerate(counts.tolist()):
             for n, (keep, limit) in enumerate(zip(self._keep, self._limits, strict=True)):
                 self._sums[n] = min(keep * self._sums[n] + count, limit)
             sums[:, t] = self._sums
-        units = (sums - NOMINAL) / self._excess
-        beyond = np.maximum(units, STEEP)
-        return np.minimum(units, STEEP + STEEP * np.log(beyond / STEEP))
+        return (sums - NOMINAL) / self._excess
