@@ -1,7 +1,8 @@
-"""Speed and memory of detectors on one core, beside the processor's peak, and with 1 000 sensors.
+"""Speed and memory of detectors on one core, beside the processor's peak, and with large data.
 
 ``python benchmarks/bench_detectors.py [--split mini] [--env hopper] [--detector NAMES]
-[--wide NAMES] [--param K=V]``, some seconds a row on an idle core, a minute with networks.
+[--wide NAMES] [--shape NAMES] [--param K=V]``, some seconds a row on an idle core, a minute with
+networks.
 
 Each row has a process of its own, so that its memory is its own, too. Times are of the processor,
 which other work on the machine slows less than the clock's. Operations are those of the products
@@ -9,8 +10,9 @@ with the matrices that a fit keeps; the peak is that of large products in double
 same minute. A detector streams a row as a block of several, which is what makes its bits those of
 the batch.
 
-The second table has 20 episodes of 200 rows and 1 000 sensors. Exit code 1 when a fit of it takes
-more than two minutes or the process more than 2 GB.
+The second table has episodes of other shapes: by default 20 of 200 rows and 1 000 sensors;
+``--shape all --wide panel`` also has 20 of 500 rows and 52 sensors, and 10^6 rows of 8 sensors.
+Exit code 1 when a fit takes longer, or the process has more memory, than `SHAPES` allows.
 """
 
 import argparse
@@ -35,8 +37,12 @@ USES = {"loadings": 2, "components": 2}
 """How often a row is multiplied by an array of a state, where that is not once."""
 UNUSED = ("prior", "tails")
 """Parts of names of arrays that no row is multiplied by."""
-WIDE = {"sensors": 1000, "episodes": 20, "rows": 200}
-MOST_SECONDS, MOST_MEGABYTES = 120.0, 2000.0
+SHAPES = {
+    "52-sensors": (52, 20, 500, 30.0, 1000.0),
+    "1000-sensors": (1000, 20, 200, 120.0, 2000.0),
+    "million-rows": (8, 1000, 1000, 300.0, 1500.0),
+}
+"""Sensors, episodes, rows of each, and most seconds of a fit and megabytes of its process."""
 
 
 def peak():
@@ -111,18 +117,18 @@ def measured(split, environment, name, parameters):
     return [environment, name, fit, batch, count / 1e6, share, median, slow, held, megabytes()]
 
 
-def wide(name, parameters):
-    """Return the row of one detector with many sensors: slow walks of a few causes, and noise."""
+def large(shape, name, parameters):
+    """Return the row of one detector with a shape: slow walks of a few causes, and noise."""
     rng = np.random.default_rng(0)
-    d, n = WIDE["sensors"], WIDE["rows"]
+    d, count, n, *_ = SHAPES[shape]
     mixing = rng.normal(size=(20, d)) / 10
     rows = (
         np.cumsum(rng.normal(size=(n, 20)), axis=0) @ mixing + rng.normal(size=(n, d))
-        for _ in range(WIDE["episodes"])
+        for _ in range(count)
     )
     episodes = [Trajectory(x.astype(np.float32), np.zeros((n - 1, 0), np.float32)) for x in rows]
     detector, _ = unfitted(name, parameters)
-    return [name, *timed(detector, episodes, episodes[:2]), megabytes()]
+    return [shape, name, *timed(detector, episodes, episodes[:2]), megabytes()]
 
 
 def megabytes():
@@ -144,7 +150,8 @@ def main():
     parser.add_argument("--split", default="mini", help="name or path")
     parser.add_argument("--env", default="hopper", help="names or globs of environments, or none")
     parser.add_argument("--detector", default=ROWS, help="names or globs of detectors")
-    parser.add_argument("--wide", default=MANY, help="those with 1 000 sensors, or none")
+    parser.add_argument("--wide", default=MANY, help="those with other shapes, or none")
+    parser.add_argument("--shape", default="1000-sensors", help="names of shapes, or all")
     parser.add_argument("--param", type=pair, action="append", default=[], metavar="K=V")
     args = parser.parse_args()
     names, many = (
@@ -156,6 +163,7 @@ def main():
     streamed = ["streamed, us", "99 %, us"]
     heads = ["", "", *times, "MFLOP a row", "of peak", *streamed, "state, MB", "process, MB"]
     parameters = dict(args.param)
+    shapes = select("shape", args.shape, SHAPES) if many else []
     with multiprocessing.get_context("spawn").Pool(1, maxtasksperchild=1) as pool:
         rows = [
             pool.apply(measured, (args.split, e, name, parameters))
@@ -164,10 +172,10 @@ def main():
         ]
         form = ("", "", ".2f", ".0f", ".2f", ".2f", ".0f", ".0f", ".2f", ".0f")
         print(tabulate(rows, heads, floatfmt=form), flush=True)
-        lots = [pool.apply(wide, (name, parameters)) for name in many]
-    form = ("", ".1f", ".0f", ".0f", ".0f", ".0f")
-    print("\n" + tabulate(lots, ["", *times, *streamed, "process, MB"], floatfmt=form))
-    return any(row[1] > MOST_SECONDS or row[-1] > MOST_MEGABYTES for row in lots)
+        lots = [pool.apply(large, (s, name, parameters)) for s in shapes for name in many]
+    form = ("", "", ".1f", ".0f", ".0f", ".0f", ".0f")
+    print("\n" + tabulate(lots, ["", "", *times, *streamed, "process, MB"], floatfmt=form))
+    return any(row[2] > SHAPES[row[0]][-2] or row[-1] > SHAPES[row[0]][-1] for row in lots)
 
 
 if __name__ == "__main__":
