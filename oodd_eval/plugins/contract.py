@@ -51,7 +51,7 @@ MAX_WARM_UP: Final = 20
 """Longest leading block, in rows, that a detector may declare undefined beyond its horizon."""
 
 TOLERANCE: Final = 1e-3
-"""Difference that stands for the same score where matrices differ in shape: see `difference`.
+"""Difference that stands for the same score where matrices differ in shape.
 
 Summation orders, and so the last digits, depend on it. The same computation gives the same bits.
 """
@@ -158,7 +158,7 @@ class StreamingDetector(Detector, Protocol):
     ) -> float:
         """Return the score of the next observation: that of `score`.
 
-        They may differ by 1e-5 of the spread of scores, 1e-4 at horizons above 1 (`difference`).
+        They may differ by 1e-5 of the spread of scores, 1e-4 at horizons above 1.
 
         Parameters
         ----------
@@ -521,31 +521,3 @@ def check_scores(
     else:
         return scores
     raise ContractError(f"detector {detector!r} returned {wrong}")
-
-
-def difference(scores: Scores, whole: Scores, tolerance: float = 0.0) -> str:
-    """Return where scores of first rows differ from the `whole` episode's; empty if nowhere.
-
-    The tolerance is relative to how far scores vary around the score: to its distance from the
-    k-th nearest other score of the episode, k being a tenth of all. So neither a constant that is
-    added to scores, nor a single enormous one, nor a step hides a difference. Where a tenth of all
-    scores are equal, they have to be equal here, too.
-    """
-    import numpy as np  # noqa: PLC0415  see above
-
-    expected = whole[: len(scores)]
-    # Scores near the largest float overflow here; another check finds that they are too large.
-    with np.errstate(invalid="ignore", over="ignore"):
-        same = (scores == expected) | (np.isnan(scores) & np.isnan(expected))
-        if tolerance and not same.all():
-            finite = whole[np.isfinite(whole)]
-            k = max(1, len(finite) // 10)
-            for row in np.flatnonzero(~same) if len(finite) > k else ():
-                # The nearest one is the score itself.
-                spread = np.partition(np.abs(finite - expected[row]), k)[k]
-                same[row] = abs(scores[row] - expected[row]) <= tolerance * spread
-    if same.all():
-        return ""
-    t = int(np.flatnonzero(~same)[0])
-    digits = 10 if f"{scores[t]:.10g}" != f"{expected[t]:.10g}" else 17
-    return f"at t = {t} it is {scores[t]:.{digits}g} instead of {expected[t]:.{digits}g}"

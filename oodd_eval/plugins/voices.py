@@ -27,8 +27,6 @@ FAULTS: Final = 48
 WORTH_SAYING: Final = 0.03
 """Share of the faults that a voice has to cost to be spoken of."""
 
-_WITHIN: Final = FOUND_WITHIN[0]
-_SHORTEST: Final = 8  # rows of an episode that takes a fault
 _STRENGTHS: Final = (-5.0, 2.0)  # powers of two, in standard deviations of a sensor
 
 
@@ -172,7 +170,7 @@ def injected_faults(
     One or two sensors are stuck, shifted or noisy, the same ones in every call. None begins before
     row `start`.
     """
-    usable = [x for x in nominal if len(x) >= start + _SHORTEST]
+    usable = [x for x in nominal if len(x) >= start + 8]  # that have a row before the fault
     if not usable:
         return
     rng = np.random.default_rng(0)
@@ -182,7 +180,7 @@ def injected_faults(
         length = len(episode) - start
         # Not later than need be: the rows before a fault take time.
         onset = start + int(rng.integers(min(length // 4, 75), min(length // 2, 100)))
-        rows = episode.observations[: onset + _WITHIN].astype(np.float64)
+        rows = episode.observations[: onset + FOUND_WITHIN[0]].astype(np.float64)
         columns = rng.permutation(np.flatnonzero(spread))[: rng.integers(1, 3)]
         draws = rng.normal(size=(len(rows) - onset, len(columns)))
         by = spread[columns] * 2 ** rng.uniform(*_STRENGTHS)

@@ -30,7 +30,7 @@ from oodd_eval.metrics.cusum import Standardization
 from oodd_eval.metrics.faults import StreamScale, readings
 from oodd_eval.metrics.recalibration import Draws, PairedScores, Recalibration
 from oodd_eval.metrics.unpaired import UnpairedScores
-from oodd_eval.plugins.contract import ROLLOUT_TOLERANCE, TOLERANCE, Scores, difference
+from oodd_eval.plugins.contract import ROLLOUT_TOLERANCE, TOLERANCE, Scores
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
 from oodd_eval.results.identity import Cell
 from oodd_eval.results.record import NAN, CodedDraws, Metric, Record
@@ -363,7 +363,7 @@ def check_before_effect(
         Prediction horizon: forecasts that feed on themselves multiply what rounding leaves.
     streamed
         True where rows were scored one by one. Then scores agree bit for bit, else up to the
-        tolerance of batches, see `oodd_eval.plugins.contract.difference`.
+        tolerance of batches, see `difference`.
     """
     tolerance = 0.0 if streamed else TOLERANCE if horizon == 1 else ROLLOUT_TOLERANCE
     for part, rows in effects.items():
@@ -375,6 +375,32 @@ def check_before_effect(
                     f"not those of its twin before t = {effect}, where they begin to differ: "
                     f"{problem}; {_MEANING} (`oodd-eval check {detector} -k prefix`)"
                 )
+
+
+def difference(scores: Scores, whole: Scores, tolerance: float = 0.0) -> str:
+    """Return where scores of first rows differ from the `whole` episode's; empty if nowhere.
+
+    The tolerance is relative to how far scores vary around the score: to its distance from the
+    k-th nearest other score of the episode, k being a tenth of all. So neither a constant that is
+    added to scores, nor a single enormous one, nor a step hides a difference. Where a tenth of all
+    scores are equal, they have to be equal here, too.
+    """
+    expected = whole[: len(scores)]
+    # Scores near the largest float overflow here; another check finds that they are too large.
+    with np.errstate(invalid="ignore", over="ignore"):
+        same = (scores == expected) | (np.isnan(scores) & np.isnan(expected))
+        if tolerance and not same.all():
+            finite = whole[np.isfinite(whole)]
+            k = max(1, len(finite) // 10)
+            for row in np.flatnonzero(~same) if len(finite) > k else ():
+                # The nearest one is the score itself.
+                spread = np.partition(np.abs(finite - expected[row]), k)[k]
+                same[row] = abs(scores[row] - expected[row]) <= tolerance * spread
+    if same.all():
+        return ""
+    t = int(np.flatnonzero(~same)[0])
+    digits = 10 if f"{scores[t]:.10g}" != f"{expected[t]:.10g}" else 17
+    return f"at t = {t} it is {scores[t]:.{digits}g} instead of {expected[t]:.{digits}g}"
 
 
 def early_difference(record: Record) -> str:

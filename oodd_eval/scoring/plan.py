@@ -167,13 +167,10 @@ def make_plan(
         if not conditions:
             continue
         actions = split.manifest["environments"][environment]["actions"]
-        for offer, arguments in zip(offers, values, strict=True):
-            row = offer, arguments
-            if actions:
-                row = plugins.taking_actions(offer, arguments, detectors)
+        for offer, params in zip(offers, values, strict=True):
+            row = plugins.taking_actions(offer, params, detectors) if actions else (offer, params)
             if row[0] is not offer:
-                names = offer.spec.name, row[0].spec.name
-                taking.setdefault(names, []).append(environment)
+                taking.setdefault((offer.spec.name, row[0].spec.name), []).append(environment)
             units += [
                 make_unit(*row, split, environment, conditions, horizon, seed, limit, rolling)
                 for horizon in horizons

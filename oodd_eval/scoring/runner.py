@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from graphlib import TopologicalSorter
 from queue import SimpleQueue
-from typing import Any, Final
+from typing import Any
 
 from oodd_eval.data.files import write_text
 from oodd_eval.data.split import Split
@@ -27,12 +27,6 @@ from oodd_eval.scoring.executors import Executor, RunSettings, check_executor, o
 from oodd_eval.scoring.observers import Observers
 from oodd_eval.scoring.plan import Plan, Unit
 from oodd_eval.scoring.unit import COSTS, Scored, UnitJob
-
-TRAINING: Final = 10.0
-"""Seconds that a fit is taken to last that needs further libraries and says nothing itself."""
-
-QUICK: Final = 5.0
-"""Seconds below which fits of the first environment come first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,11 +117,11 @@ def _turn(plan: Plan, unit: Unit, plugins: Plugins) -> tuple[bool, bool, float]:
     """Return by which units are sorted: long ones first, that all threads end together."""
     spec = plugins.offer(unit.setting.detector).spec
     # Detectors that need further libraries train networks and forests.
-    seconds = spec.seconds or TRAINING * bool(spec.requires)
-    # Figures of quick ones can be seen early.
-    early = seconds < QUICK and unit.environment == plan.units[0].environment
+    seconds = spec.seconds or 10.0 * bool(spec.requires)
+    # Figures of quick ones of the first environment can be seen early.
+    waits = seconds > 0 or unit.environment != plan.units[0].environment
     # What runs in this thread keeps others from being begun.
-    return unit.local, not early, -seconds
+    return unit.local, waits, -seconds
 
 
 def _as_they_finish(

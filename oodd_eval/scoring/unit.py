@@ -211,14 +211,13 @@ class GroupedScoring:
         """Check every score sequence of a worker and put them in their places."""
         if outcome.status != "ok":
             return Scored(outcome.status, outcome.reason, log=outcome.log)  # type: ignore[arg-type]
-        steps = sum(map(sum, self._lengths.values()))
         cost = {name: value for name in COSTS if (value := getattr(outcome, name)) is not None}
         try:
             explained = outcome.explained if outcome.explains else None
             scores = self._file(outcome.scores, explained, outcome.warm_up)
         except ContractError as error:
             return Scored("invalid", str(error), log=outcome.log)
-        cost["steps_scored"] = steps
+        cost["steps_scored"] = sum(map(sum, self._lengths.values()))
         return Scored(file=replace(scores, cost=cost, voices=outcome.voices))
 
     def in_process(self) -> Scored:
@@ -303,9 +302,8 @@ class GroupedScoring:
         }
         for group in self._groups:
             if alarmed := [member for member in group if member in self._explained]:
-                rows_of = [self._explained[member] for member in alarmed]
-                pairs = zip(self._members(alarmed), rows_of, strict=True)
-                yield (trajectory[:rows] for trajectory, rows in pairs)
+                pairs = zip(alarmed, self._members(alarmed), strict=True)
+                yield (trajectory[: self._explained[member]] for member, trajectory in pairs)
 
     def _members(self, group: Iterable[Member]) -> Iterator[Trajectory]:
         return (self._visible(self._sets[part][i]) for part, i in group)

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from oodd_eval.metrics.auc import auc
-from oodd_eval.plugins.contract import ROLLOUT_TOLERANCE, TOLERANCE, difference
+from oodd_eval.plugins.contract import ROLLOUT_TOLERANCE, TOLERANCE
+from oodd_eval.results.evaluate import difference
 
 ROWS = 300
 T = np.arange(float(ROWS))

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from oodd_eval import evaluate
 from oodd_eval.errors import ContractError
-from oodd_eval.plugins.contract import TOLERANCE, difference
-from oodd_eval.results.evaluate import check_before_effect, early_difference
+from oodd_eval.plugins.contract import TOLERANCE
+from oodd_eval.results.evaluate import check_before_effect, difference, early_difference
 
 WHOLE = np.array([math.nan, 1.0, 2.0, 3.0, 2.0])
 

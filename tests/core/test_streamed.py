@@ -11,11 +11,12 @@ from oodd_eval import load_split
 from oodd_eval.data.parts import lengths_of, parts_of
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import UsageError
-from oodd_eval.plugins.contract import TOLERANCE, difference
+from oodd_eval.plugins.contract import TOLERANCE
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.plugins.isolation import SCORES, supervisor
 from oodd_eval.plugins.isolation.child import Limits
 from oodd_eval.results.directory import ResultsDirectory
+from oodd_eval.results.evaluate import difference
 from oodd_eval.scoring.executors import RunSettings
 from oodd_eval.scoring.plan import make_plan
 from oodd_eval.scoring.runner import run
