@@ -163,8 +163,7 @@ def make_plan(
     units: list[Unit] = []
     taking: dict[tuple[str, str], list[str]] = {}  # environments by detector and its replacement
     for environment in environments:
-        conditions = _chosen(split.conditions(environment), anomalies)
-        if not conditions:
+        if not (conditions := _chosen(split.conditions(environment), anomalies)):
             continue
         actions = split.manifest["environments"][environment]["actions"]
         for offer, params in zip(offers, values, strict=True):

@@ -118,10 +118,9 @@ def _turn(plan: Plan, unit: Unit, plugins: Plugins) -> tuple[bool, bool, float]:
     spec = plugins.offer(unit.setting.detector).spec
     # Detectors that need further libraries train networks and forests.
     seconds = spec.seconds or 10.0 * bool(spec.requires)
-    # Figures of quick ones of the first environment can be seen early.
-    waits = seconds > 0 or unit.environment != plan.units[0].environment
-    # What runs in this thread keeps others from being begun.
-    return unit.local, waits, -seconds
+    # What runs in this thread keeps others from being begun. Figures of quick ones of the first
+    # environment can be seen early.
+    return unit.local, seconds > 0 or unit.environment != plan.units[0].environment, -seconds
 
 
 def _as_they_finish(
