@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from oodd_leaderboard.pages import Leaderboard, read_leaderboard
+from oodd_leaderboard.standings import primary_settings
 
 from oodd_eval.results.board import Board, boards
 from oodd_eval.results.directory import ResultsDirectory
@@ -57,6 +58,14 @@ def board(name: str) -> Board:
     return of_split
 
 
+def primary(records: Board, name: str) -> Setting:
+    """Return the row of a board that stands for a detector."""
+    with_defaults = Setting(name)
+    if with_defaults in records.entries:
+        return with_defaults
+    return next(s for s in primary_settings(records.records) if s.detector == name)
+
+
 def mean(
     name: str,
     row: str | Setting,
@@ -67,7 +76,7 @@ def mean(
 ) -> float:
     """Return a row's mean of a metric in per cent, by default over all cells."""
     records = board(name)
-    setting = row if isinstance(row, Setting) else Setting(row)
+    setting = row if isinstance(row, Setting) else primary(records, row)
     over = [*environments] or records.environments, [*anomalies] or records.anomalies
     return 100 * records.mean(setting, *over, metric).value
 

@@ -33,6 +33,7 @@ from committed import (
     mean,
     of_reproductions,
     overview,
+    primary,
     ranking,
     reported,
 )
@@ -58,7 +59,9 @@ def five_columns(split: str) -> dict[str, list[str]]:
     """Return the five columns of the rows reported on a split, as text, by detector."""
     (board,) = (s.ranks.board for s in leaderboard().reported if s.ranks.board.split == split)
     table = Tables(board).headline()
-    return {name: texts for name, *texts in table.rows} if table else {}
+    texts = {name: texts for name, *texts in table.rows} if table else {}
+    detectors = {row.detector for row in board.entries}
+    return texts | {name: texts[str(primary(board, name))] for name in detectors}
 
 
 def of_board(split: str) -> Row:

@@ -14,7 +14,7 @@ They are strangers' files: read within bounds and held to the rules of `oodd_lea
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Final
@@ -71,7 +71,24 @@ def read_reported(leaderboard: Path) -> list[Reported]:
     paths = [p for name in (RESULTS, ENTRIES) for p in sorted((leaderboard / name).glob("*/"))]
     # A name with a leading dot is of an entry that is being written.
     paths = [p for p in paths if not p.name.startswith(".") and find_file(p / RECORDS)]
-    return [Reported(path, read_strange_records(path)) for path in paths]
+    variants = [entry for entry in entries_of(leaderboard) if entry.variant]
+    return [
+        Reported(path, [_as_run(record, variants) for record in read_strange_records(path)])
+        for path in paths
+    ]
+
+
+def _as_run(record: Record, variants: Iterable[Entry]) -> Record:
+    """Return a record as that of the variant whose parameters it was made with, if there is one.
+
+    They were the defaults, perhaps, when it was made.
+    """
+    for entry in variants:
+        parameters = dict(entry.parameters)
+        same = {name: record.parameters.get(name) for name in parameters} == parameters
+        if parameters and same and entry.detector == record.detector:
+            return replace(record, overrides=parameters | record.overrides)
+    return record
 
 
 def read_strange_records(directory: Path) -> list[Record]:

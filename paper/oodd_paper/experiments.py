@@ -4,6 +4,7 @@ import tomllib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final, Literal, NamedTuple, Self, TypeVar
 
 import numpy as np
@@ -143,8 +144,21 @@ def read_tables(file: Path, kind: str, make: Callable[..., _T]) -> tuple[_T, ...
     return tuple(objects.values())
 
 
+_TABLES: Final = tomllib.loads(FILE.read_text("utf-8"))
 # Deterministic detectors; all experiments but Table 2, in the order of the page.
-CONTROLS: Final[tuple[str, ...]] = tuple(tomllib.loads(FILE.read_text("utf-8"))["controls"])
+CONTROLS: Final[tuple[str, ...]] = tuple(_TABLES["controls"])
+PAPER: Final[Mapping[str, Mapping[str, Any]]] = _TABLES["paper"]
+"""The paper's parameters by detector, where they are not our defaults."""
+
+
+def of_paper(setting: Setting, parameters: Mapping[str, Any] = MappingProxyType({})) -> Setting:
+    """Return a setting that tells what differs from the paper's parameters, not from defaults."""
+    paper = PAPER.get(setting.detector, {})
+    used = {name: parameters[name] for name in paper if name in parameters} | setting.overrides
+    differing = {n: v for n, v in used.items() if n not in paper or v != paper[n]}
+    return Setting.of(setting.detector, setting.horizon, differing, rolling=setting.rolling)
+
+
 EXPERIMENTS: Final = read_tables(FILE, "experiment", Experiment.of)
 TIERS: Final = {tier.name: tier for tier in read_tables(FILE, "tier", Tier)}
 

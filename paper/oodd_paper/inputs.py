@@ -7,7 +7,7 @@ import contextlib
 import csv
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -22,7 +22,7 @@ from oodd_eval.errors import ResultsError, UsageError
 from oodd_eval.results.directory import RECORDS, ResultsDirectory
 from oodd_eval.results.identity import Cell
 from oodd_eval.results.record import Record
-from oodd_paper.experiments import EXPERIMENTS, Tier, settings_of
+from oodd_paper.experiments import EXPERIMENTS, PAPER, Tier, of_paper, settings_of
 
 HEADER: Final = "reproduction.json"
 RETURNS: Final = "returns.json"
@@ -46,11 +46,19 @@ class Reproduction:
     units: int
 
     def select(self, records: Iterable[Record]) -> list[Record]:
-        """Return the records that belong to it: its whole data, its settings, its seeds."""
+        """Return the records that belong to it: its whole data, its settings, its seeds.
+
+        They tell what differs from the paper's parameters, see `of_paper`.
+        """
         seeds = {setting: self.tier.seeds(setting) for setting in settings_of(EXPERIMENTS)}
         data = self.split_digest, self.protocol, None
         whole = (r for r in records if (r.split_digest, r.protocol, r.limit) == data)
-        return [r for r in whole if r.seed in seeds.get(r.setting, ())]
+        named = [
+            replace(r, overrides=of_paper(r.setting, r.parameters).overrides)
+            if r.detector in PAPER else r
+            for r in whole
+        ]  # fmt: skip
+        return [r for r in named if r.seed in seeds.get(r.setting, ())]
 
     @classmethod
     def load(cls, directory: Path) -> "Reproduction":

@@ -21,7 +21,7 @@ from oodd_eval.prose import Table
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
 from oodd_eval.scoring.plan import Unit, make_unit
-from oodd_paper.experiments import CONTROLS, Experiment, Tier, settings_of
+from oodd_paper.experiments import CONTROLS, PAPER, Experiment, Tier, of_paper, settings_of
 
 # Units run stage after stage, and within a stage environment by environment.
 STAGES: Final = (
@@ -54,7 +54,8 @@ def lay_out(
     """Return every unit that some experiments need, cheap and informative ones first."""
     units, names = [], list(split.environments)
     for setting in settings_of(experiments):
-        offer, parameters = plugins.offer(setting.detector), setting.overrides
+        offer = plugins.offer(setting.detector)
+        parameters = {**PAPER.get(setting.detector, {}), **setting.overrides}
         if device is not None and "device" in parameters_of(offer.spec.parameters):
             parameters["device"] = device
         units += [
@@ -71,7 +72,7 @@ def stage_of(unit: Unit) -> int:
     """Return the index into `STAGES`."""
     if unit.setting.detector in CONTROLS:
         return 0
-    variant = bool(unit.setting.parameters)
+    variant = bool(of_paper(unit.setting).parameters)
     if unit.setting.horizon > 1:
         return 7 if unit.seed else 3 if unit.setting.horizon == 10 else 4
     if unit.seed:
@@ -97,7 +98,8 @@ def scored_rows(split: Split) -> dict[str, int]:
 
 def estimated_cost(setting: Setting, environment: str, rows: int) -> tuple[float, float]:
     """Return seconds on one core: of the fit, which units may share, and of everything else."""
-    fit, per_thousand = COSTS.get(environment, {}).get(str(setting), UNKNOWN)
+    name = str(of_paper(setting))
+    fit, per_thousand = COSTS.get(environment, {}).get(name, UNKNOWN)
     return fit, WORKER_START + per_thousand * rows / 1000
 
 

@@ -129,6 +129,20 @@ def test_the_entry_of_a_detector_is_that_of_its_ranked_row():
     assert by_detector([ranked, variant]) == by_detector([variant, ranked]) == {"mine": ranked}
 
 
+def test_a_record_is_of_the_variant_whose_parameters_it_was_made_with(leaderboard):
+    path = leaderboard / "entries/mine/records.jsonl"
+    plain = [json.loads(line) for line in path.read_text().splitlines()]
+    made = [p | {"parameters": {"members": 5, "samples": 8}, "overrides": {}} for p in plain]
+    path.write_text("".join(json.dumps(p) + "\n" for p in made))
+    entry = 'detector = "riqn"\nvariant = true\nparameters = {members = 5}\n'
+    (leaderboard / "entries/riqn-5.toml").write_text(entry)
+    (table,) = read_leaderboard(leaderboard).reported
+    assert str(table.ranks.standings[0].entry) == "riqn[members=5]"
+    (leaderboard / "entries/riqn-5.toml").write_text(entry.replace("5", "3"))
+    (table,) = read_leaderboard(leaderboard).reported
+    assert str(table.ranks.standings[0].entry) == "riqn"
+
+
 def test_a_row_is_of_one_directory(leaderboard):
     other = leaderboard / "results" / "other"
     other.mkdir()

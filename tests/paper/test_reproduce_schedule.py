@@ -5,7 +5,7 @@ import dataclasses
 
 import pytest
 from helpers_records import make_record
-from oodd_paper.experiments import EXPERIMENTS, TIERS
+from oodd_paper.experiments import EXPERIMENTS, TIERS, of_paper
 from oodd_paper.run import (
     Progress,
     duration,
@@ -47,8 +47,16 @@ def test_every_unit_is_there_once_and_only_what_is_wanted(mini):
     assert all(len(u.conditions) == 8 for u in mini)
     delays = [e for e in EXPERIMENTS if e.id == "delays"]
     units = lay_out(delays, TIERS["mini"], load_split("mini"), discover())
-    assert {str(u.setting) for u in units} == {"riqn", "riqn[h=10]", "riqn[h=20]"}
+    assert {str(of_paper(u.setting)) for u in units} == {"riqn", "riqn[h=10]", "riqn[h=20]"}
+    assert {(u.parameters["members"], u.parameters["updates"]) for u in units} == {(5, 2500)}
     assert len(units) == 7 * (3 + 1 + 1)
+
+
+def test_records_are_those_of_the_paper_by_their_parameters_whatever_the_defaults_were():
+    paper, fewer = {"members": 5, "updates": 2500}, {"members": 3, "updates": 1250}
+    assert of_paper(RIQN, paper) == of_paper(Setting.of("riqn", 1, paper), paper) == RIQN
+    assert of_paper(RIQN, fewer) == Setting.of("riqn", 1, fewer)
+    assert of_paper(Setting("npn"), fewer) == Setting("npn")
 
 
 def test_a_device_reaches_the_detectors_that_have_one_and_changes_no_row(mini):
@@ -79,11 +87,14 @@ def test_seeds_are_three_at_delta_one_and_one_where_scoring_is_expensive():
 
 def test_sampling_sizes_share_a_fit_that_the_first_of_them_makes(mini):
     ant = [u for u in mini if u.environment == "ant" and u.seed == 0]
-    own = [u for u in ant if u.setting.detector == "riqn" and "members" not in u.setting.overrides]
+    own = [
+        u for u in ant
+        if u.setting.detector == "riqn" and "members" not in of_paper(u.setting).overrides
+    ]  # fmt: skip
     near = [u for u in own if u.setting.horizon == 1]
     assert len(near) > 1
     assert len({u.fit_key for u in near}) == 1
-    assert near[0].setting == RIQN
+    assert of_paper(near[0].setting) == RIQN
     # Networks are trained on their own samples where they are to forecast further than one step.
     assert len({u.fit_key for u in own}) == len({u.setting.horizon for u in own}) == 3
     assert len({u.fit_key for u in ant if u.setting.detector == "rf"}) == 1

@@ -16,15 +16,23 @@ from oodd_eval.plugins.parameters import checked, parameter
 
 
 @dataclass(frozen=True)
-class RiqnParameters(NetworkParameters):
-    """Parameters of `riqn` and `riqn-ms`."""
+class QuantileParameters(NetworkParameters):
+    """Parameters of all four."""
 
     samples: int = parameter(8, low=1, decides="scores", help="samples of each network, M")
     levels: int = parameter(8, low=1, help="quantile levels of an update, one per equal part")
 
 
 @dataclass(frozen=True)
-class WindowRiqnParameters(RiqnParameters):
+class RiqnParameters(QuantileParameters):
+    """Parameters of `riqn`, `riqn-ms` and `riqn-r`: a third of the paper's work by default."""
+
+    members: int = parameter(3, low=1, help="networks in the ensemble, e; the paper has 5")
+    updates: int = parameter(1250, low=1, help="gradient steps of each member")
+
+
+@dataclass(frozen=True)
+class WindowRiqnParameters(QuantileParameters):
     """Parameters of `n-riqn`."""
 
     window: int = parameter(4, low=1, help="observations in the input, W")
@@ -53,7 +61,9 @@ def n_riqn(*, seed: int = 0, horizon: int = 1, **values: Any) -> Detector:
     return _make("n-riqn", parameters, seed, horizon, window=parameters.window, recurrent=False)
 
 
-def _make(name: str, parameters: RiqnParameters, seed: int, horizon: int, **kind: Any) -> Detector:
+def _make(
+    name: str, parameters: QuantileParameters, seed: int, horizon: int, **kind: Any
+) -> Detector:
     # torch takes a second to import, and listing detectors should not.
     from oodd_torch.detector import NetworkDetector  # noqa: PLC0415
 
