@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers_state import assert_zero_scales_are_refused
 from oodd_rivals import oodd_detectors
-from oodd_rivals.arcade import FOLLOWED, LEARNT, MOST_INPUTS, Heads, Pair, features, fitted
+from oodd_rivals.arcade import FOLLOWED, LEARNT, MOST_INPUTS, EpisodeHeads, Pair, features, fitted
 
 from oodd_eval import Trajectory
 from oodd_eval.errors import FittedStateError, TrajectoryError
@@ -38,7 +38,7 @@ def detector():
 def test_heads_have_the_posterior_of_a_ridge_regression():
     rng = np.random.default_rng(0)
     prior, x = rng.normal(size=(3, 2)), rng.normal(size=(LEARNT, 3))
-    heads = Heads(prior, 1, 1, 0)
+    heads = EpisodeHeads(prior, 1, 1, 0)
     errors = x @ prior @ [0.4, -0.2] + 0.3 * rng.normal(size=LEARNT)
     for row, error in zip(x, errors, strict=True):
         heads(row[None], np.array([[error]]))
@@ -50,7 +50,7 @@ def test_heads_have_the_posterior_of_a_ridge_regression():
 
 
 def test_later_rows_are_learnt_so_many_rows_late():
-    heads, x = Heads(np.ones((1, 1)), 1, 1, 0), np.ones((1, 1))
+    heads, x = EpisodeHeads(np.ones((1, 1)), 1, 1, 0), np.ones((1, 1))
     for _ in range(LEARNT):
         heads(x, np.zeros((1, 1)))
     for _ in range(LEARNT):
@@ -70,9 +70,9 @@ def test_given_the_prior_of_heads_coefficients_are_those_of_the_system():
             o[t + 1] = 0.5 * o[t] + push + 0.5 * rng.normal()
         inputs = np.stack([np.roll(o[:-1], i) for i in range(6)] + [np.ones(300)], axis=1)
         pairs.append(Pair(inputs[10:], o[11:, None]))
-    plain, given = (fitted(pairs, 6, 2, rounds)["forecast"][:6, 0] for rounds in (1, 6))
+    plain, refined = (fitted(pairs, 6, 2, rounds)["forecast"][:6, 0] for rounds in (1, 6))
     assert plain.sum() > 0.9
-    assert given.sum() < 0.7
+    assert refined.sum() < 0.7
 
 
 def test_features_are_means_newest_rows_and_one():

@@ -103,7 +103,7 @@ class Arcade(NetworkRival):
     def reset(self) -> None:
         """Begin a new live episode."""
         super().reset()
-        self._live: Heads | None = None
+        self._live: EpisodeHeads | None = None
 
     def _judge(self, window: NDArray[np.float32], now: NDArray[np.float32], t: int) -> float:  # noqa: ARG002
         self._live = self._live or self._new_heads(self.weights_)
@@ -115,7 +115,7 @@ class Arcade(NetworkRival):
         moved = float(self._moved(now[None])[0])
         return self._judged(self._live, _limited(latest), _limited(row), moved)
 
-    def _judged(self, heads: Heads, inputs: Floats, row: Floats, moved: float) -> float:
+    def _judged(self, heads: EpisodeHeads, inputs: Floats, row: Floats, moved: float) -> float:
         w = self.weights_
         errors = (row - inputs @ w["forecast"]) / w["unit"]
         charts = heads(features(inputs[None], len(row), self.window), errors)
@@ -140,12 +140,12 @@ class Arcade(NetworkRival):
             )
         episodes = [*training, *held_out] if len(training) > 1 else training
         pairs = [self._pairs(episode) for episode in episodes]
-        plain, given = (self._judged_fit(pairs, rounds) for rounds in (1, ROUNDS))
+        plain, refined = (self._judged_fit(pairs, rounds) for rounds in (1, ROUNDS))
         # Each sensor has the coefficients that make rows of episodes left out likelier.
-        losses = np.stack([plain.pop("loss"), given.pop("loss")])
+        losses = np.stack([plain.pop("loss"), refined.pop("loss")])
         better, self.loss_ = losses[1] < losses[0], float(losses.min(axis=0).sum())
         self.weights_ = {
-            name: np.where(np.tile(better, w.shape[1] // max(len(better), 1)), given[name], w)
+            name: np.where(np.tile(better, w.shape[1] // max(len(better), 1)), refined[name], w)
             for name, w in plain.items()
         }
 
@@ -180,8 +180,8 @@ class Arcade(NetworkRival):
         both = np.stack(charts, axis=1), np.stack(surprises, axis=1)
         return [(c[: len(p.rows)], s[: len(p.rows)]) for c, s, p in zip(*both, pairs, strict=True)]
 
-    def _new_heads(self, fit: Weights, episodes: int = 1) -> Heads:
-        return Heads(fit["heads"], fit["unit"].shape[1], episodes, self.window)
+    def _new_heads(self, fit: Weights, episodes: int = 1) -> EpisodeHeads:
+        return EpisodeHeads(fit["heads"], fit["unit"].shape[1], episodes, self.window)
 
     def _fitted_with(self) -> dict[str, Any]:
         return settings(self.parameters, "lags", "rank") | {"horizon": self.horizon}
@@ -197,7 +197,7 @@ class Arcade(NetworkRival):
         }
 
 
-class Heads:
+class EpisodeHeads:
     """The heads of episodes side by side, row by row, and the charts of their errors.
 
     Parameters
