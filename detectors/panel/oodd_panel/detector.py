@@ -422,8 +422,8 @@ class PanelDetector(LongFitDetector):
             return False
         if self.baseline:
             return True
-        found = [self._early_faults_found(long, ridge, varies=varies) for varies in (True, False)]
-        return learning.shows_no_loss(*found)
+        shares = [self._early_faults_found(long, ridge, varies=varies) for varies in (True, False)]
+        return learning.shows_no_loss(*shares)
 
     def _early_faults_found(
         self, episodes: Sequence[tuple[Floats, StandardEpisode]], ridge: float, *, varies: bool
@@ -440,7 +440,7 @@ class PanelDetector(LongFitDetector):
             if self.basis_.size:
                 scale = np.full(left[0][0].shape[1], float(scale.mean()))
             parts.append((left, partial(_statistic, judged, tails), scale))
-        return learning.found(parts, self.horizon)
+        return learning.separation(parts, self.horizon)
 
     def _lengths(
         self,

@@ -88,7 +88,7 @@ def with_fault(
     return spoilt
 
 
-def found(
+def separation(
     parts: Sequence[tuple[Sequence[tuple[Floats, StandardEpisode]], Lengths, Floats]], first: int
 ) -> Floats:
     """Return how well early faults are found in each episode, a mean AUC of its rows.

@@ -188,7 +188,7 @@ class EnsembleVoice(Voice):
         self._panel = panel
         self.detector_: Any = None
 
-    def _wanted(self, episodes: Sequence[Trajectory]) -> bool:
+    def _is_of_use(self, episodes: Sequence[Trajectory]) -> bool:
         panel = self._panel
         if panel.parameters.forecast != "auto":
             return panel.parameters.forecast == "ensemble"
@@ -214,7 +214,7 @@ class EnsembleVoice(Voice):
 
     def fit(self, episodes: Sequence[Trajectory]) -> list[Floats]:
         """See `Voice`."""
-        if not self._wanted(episodes):
+        if not self._is_of_use(episodes):
             return []
         self.detector_ = self._unfitted().fit(episodes, self._panel.progress)
         if self._panel.parameters.forecast == "auto":
