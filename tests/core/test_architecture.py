@@ -205,7 +205,7 @@ def test_no_text_imports_what_the_contracts_forbid():
 AROUND = ("oodd_checks", "oodd_leaderboard", "oodd_live", "oodd_logs")
 LOADS = {
     "list detectors": ((*AROUND, "oodd_eval.results", "oodd_eval.scoring"), 1_950),
-    "run --detector mewma --env hopper -q": (AROUND, 10_500),
+    "run --detector mewma --env hopper -q": (AROUND, 10_600),
     "data inspect logs": (("oodd_eval.results", "oodd_eval.scoring", "oodd_live"), 6_000),
     "scan logs": (("oodd_eval.results", "oodd_eval.scoring"), 10_500),
 }
