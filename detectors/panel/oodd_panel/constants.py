@@ -424,7 +424,8 @@ class ConstantsVoice(Voice):
 
     def shares_last(self) -> Floats:
         """See `Voice`."""
-        return self.largest_.shares(self._latest, len(self.forecast_.error_scale))[0]
+        shares: Floats = self.largest_.shares(self._latest, len(self.forecast_.error_scale))[0]
+        return shares
 
     def state(self) -> State:
         """See `Voice`."""

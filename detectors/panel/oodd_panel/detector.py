@@ -374,14 +374,13 @@ class PanelDetector(LongFitDetector):
         self.forecast_, self.members_ = self._fitted(
             list(zip(rows, episodes, strict=True)), ridge, varies=varies
         )
-        members = VoiceScale().fit(statistics)
-        self.voices_, self.scales_ = {}, {MEMBERS_VOICE: members}
+        scale_of_members = VoiceScale().fit(statistics)
+        self.voices_, self.scales_ = {}, {MEMBERS_VOICE: scale_of_members}
         for voice in self._new_voices():
             if of_voice := voice.fit(visible):
                 self.voices_[voice.name] = voice
-                self.scales_[voice.name] = (
-                    VoiceScale().fit(of_voice).brought_to(members, voice.weight)
-                )
+                of_episodes = VoiceScale().fit(of_voice)
+                self.scales_[voice.name] = of_episodes.brought_to(scale_of_members, voice.weight)
         return scale
 
     def _new_voices(self) -> list[Voice]:

@@ -194,7 +194,8 @@ class _Mahalanobis(PanelMember):
     def _lengths(self, features: Floats) -> Floats:
         whitened = product(features - self.centre_, self.root_, ROWS)
         whitened *= whitened
-        return np.sqrt(np.add.reduce(whitened, axis=1))
+        lengths: Floats = np.sqrt(np.add.reduce(whitened, axis=1))
+        return lengths
 
     def arrays(self) -> Arrays:
         """Return what `restore` takes."""
@@ -326,7 +327,8 @@ class RecentRows(PanelMember):
         scores *= scores
         scores *= self.weights_
         squares = self.unit_ * np.add.reduce(centred, axis=1) + np.add.reduce(scores, axis=1)
-        return np.sqrt(np.maximum(squares, 0.0))
+        lengths: Floats = np.sqrt(np.maximum(squares, 0.0))
+        return lengths
 
     def differences(self, features: Floats) -> tuple[Floats, Floats]:
         """Return lengths (N,), and what each feature contributes to their squares, (N, F)."""
@@ -414,7 +416,7 @@ class NeighbourDistance(PanelMember):
 
     def _distances(self, query: Floats) -> Floats:
         length: Floats = np.add.reduce(query * query, axis=1, keepdims=True)
-        squares = length + self._squares
+        squares: Floats = length + self._squares
         squares += product(query, self._doubled, ROWS)
         return squares
 
@@ -429,7 +431,8 @@ class NeighbourDistance(PanelMember):
             nearest.sort(axis=1)
         np.maximum(nearest, 0.0, out=nearest)
         np.sqrt(nearest, out=nearest)
-        return np.add.reduce(nearest, axis=1) / self._nearest
+        means: Floats = np.add.reduce(nearest, axis=1) / self._nearest
+        return means
 
     def arrays(self) -> Arrays:
         """Return what `restore` takes."""

@@ -215,7 +215,8 @@ class RareEvents:
         start, length = (v[self.wide_regions_(places), 0] for v in self.wide_tails_)
         beyond = (np.log(np.maximum(squares, CONSTANT)) / 2 - start) / length
         improbability = beyond - math.log(1.0 - USUAL_LENGTH)
-        return np.minimum(np.maximum((improbability - COUNTS) * shares, 0.0), LARGEST)
+        counts: Floats = np.minimum(np.maximum((improbability - COUNTS) * shares, 0.0), LARGEST)
+        return counts
 
     def _squares(self, sizes: Floats, regions: NDArray[np.int64]) -> Floats:
         """Return squared lengths of normal numbers as improbable as sizes of residuals, (N,)."""
