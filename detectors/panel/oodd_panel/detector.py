@@ -381,6 +381,9 @@ class PanelDetector(LongFitDetector):
                 self.voices_[voice.name] = voice
                 of_episodes = VoiceScale().fit(of_voice)
                 self.scales_[voice.name] = of_episodes.brought_to(scale_of_members, voice.weight)
+        if EnsembleVoice.name in self.voices_:
+            # An episode that is new to a linear forecast need not be new to networks.
+            scale_of_members.limit()
         return scale
 
     def _new_voices(self) -> list[Voice]:

@@ -34,6 +34,8 @@ SCALES: Final = np.geomspace(0.1, 2.0, 40)
 """Scales of a tail that are tried, relative to the mean excess."""
 LEAST_SCALE: Final = 0.02
 """Least scale of a tail, relative to where it begins."""
+UNLIMITED: Final = 1e300
+"""Limit of surprises that have none."""
 SMALLEST: Final = 1e-9
 """Statistics below this are none."""
 MEMBERS_WEIGHT: Final = 0.45
@@ -87,7 +89,7 @@ class VoiceScale:
             episodes = np.array_split(values, min(FEWEST, len(values)))
         largest = [float(self.surprise(rows).max()) for rows in episodes]
         self.unit_ = np.array(max(np.mean(largest) + np.std(largest), SMALLEST))
-        self.factor_ = np.ones(())
+        self.factor_, self.limit_ = np.ones(()), np.array(UNLIMITED)
         return self
 
     def surprise(self, values: Floats) -> Floats:
@@ -101,22 +103,28 @@ class VoiceScale:
 
     def __call__(self, values: Floats) -> Floats:
         """Return surprises on the panel's scale: (N,) to (N,)."""
-        return self.factor_ * self.surprise(values)
+        limit, surprises = float(self.limit_), self.factor_ * self.surprise(values)
+        return np.minimum(surprises, limit + limit * np.log(np.maximum(surprises, limit) / limit))
 
     def brought_to(self, other: VoiceScale, weight: float) -> Self:
         """Take the unit of another scale: both exceed it in equally few episodes at weight 1."""
         self.factor_ = np.asarray(weight * other.unit_ / self.unit_)
         return self
 
+    def limit(self) -> None:
+        """Let surprises beyond the unit grow by their logarithm alone."""
+        self.limit_ = self.unit_
+
     def arrays(self) -> Arrays:
         """Return what `restore` takes."""
-        return {"knots": self.knots_, "tail": self.tail_, "factor": self.factor_}
+        names = ("knots", "tail", "factor", "limit")
+        return {name: getattr(self, f"{name}_") for name in names}
 
     def restore(self, arrays: Arrays) -> Self:
         """Take over a fit."""
         self.knots_ = take(arrays, "knots", KNOTS.shape)
         self.tail_ = take(arrays, "tail", (2,))
-        self.factor_ = take(arrays, "factor", (), "+")
+        self.factor_, self.limit_ = (take(arrays, name, (), "+") for name in ("factor", "limit"))
         return self
 
 
