@@ -320,6 +320,11 @@ class StreamScale:
             Nominal episodes as they were recorded.
         base
             Baseline rows; None where none are declared.
+
+        Returns
+        -------
+        StreamScale
+            Whose tails are those of the calibration episodes.
         """
         rows, judged = [], []
         for x in train:
@@ -345,6 +350,11 @@ class StreamScale:
             same rows, NaN in those of a baseline.
         odd
             Share of the episodes that may not be nominal.
+
+        Returns
+        -------
+        StreamScale
+            Whose tails are those of the episodes.
         """
         sensors, lost, again, lengths = [], [], [], []
         for rows, judged in episodes:
@@ -375,11 +385,21 @@ class StreamScale:
         """Return the scale for calibration episode i: its tails are those of all others.
 
         So a calibration episode is as surprising as a further one would be.
+
+        Parameters
+        ----------
+        i
+            Number of the episode, from 0.
+
+        Returns
+        -------
+        StreamScale
+            With the same ranges and units.
         """
         return replace(self, tails=_tails(np.delete(self.largest, i, axis=0), self.floors))
 
     def surprise(self, rows: NDArray[Any], judged: NDArray[Any] | None = None) -> Floats:
-        """Return the surprise of every row of an episode, (R,); 0 where nothing is unusual.
+        """Return the surprise of every row of an episode.
 
         Parameters
         ----------
@@ -387,6 +407,11 @@ class StreamScale:
             Readings, (R, D), NaN where there is none.
         judged
             As in `fit`.
+
+        Returns
+        -------
+        array of shape (R,)
+            In nats; 0 where nothing is unusual.
         """
         counts = _count(self.limits, rows, judged)
         largest = np.full((len(rows), len(KINDS)), -np.inf)
@@ -395,7 +420,8 @@ class StreamScale:
             largest[:, :-1] = np.maximum(largest[:, :-1], units.T)
         largest[:, 0] = np.maximum(largest[:, 0], counts.lost)
         largest[:, -1] = counts.repeated
-        return self.of_kinds(largest).max(axis=1)
+        surprise: Floats = self.of_kinds(largest).max(axis=1)
+        return surprise
 
     def faults(
         self, rows: NDArray[Any], judged: NDArray[Any] | None, least: float
@@ -432,25 +458,66 @@ class StreamScale:
         return named
 
     def units(self, values: Floats, some: slice = slice(None)) -> Floats:
-        """Return counts of the first four kinds, (4, ..., D), in units beyond what is usual."""
+        """Return counts of the first four kinds in units beyond what is usual.
+
+        Parameters
+        ----------
+        values
+            Counts by kind and sensor, (4, ..., D).
+        some
+            Sensors that these are of; by default all.
+
+        Returns
+        -------
+        array of shape (4, ..., D)
+            Negative where a count is below its usual largest value.
+        """
         between = (slice(None), *(None,) * (values.ndim - 2), some)
         units: Floats = (values - self.start[between]) * self.per_unit[between]
         return units
 
     def of_kinds(self, values: Floats) -> Floats:
-        """Return the surprise of values of the five kinds, (..., 5), for one of which it is."""
+        """Return the surprise of values of the five kinds, each as one of the five.
+
+        Parameters
+        ----------
+        values
+            Largest of all sensors by kind, (..., 5), in the units of `units`; rows repeated last.
+
+        Returns
+        -------
+        array of shape (..., 5)
+            In nats, less log 5 for the choice of a kind; at least 0.
+        """
         surprise: Floats = np.maximum(self.tails.surprise(values) - math.log(len(KINDS)), 0.0)
         return surprise
 
     def arrays(self) -> dict[str, Floats]:
-        """Return what `of` reads."""
+        """Return what `of` reads.
+
+        Returns
+        -------
+        dict of str to array
+            By name: ranges of sensors, and their scales.
+        """
         limits = {f.name: getattr(self.limits, f.name) for f in fields(self.limits)}
         tails = np.array(self.tails)
         return limits | {"start": self.start, "per_unit": self.per_unit, "tails": tails}
 
     @classmethod
     def of(cls, arrays: Mapping[str, Floats]) -> "StreamScale":
-        """Return the scales that `arrays` were of."""
+        """Return the scales that `arrays` were of.
+
+        Parameters
+        ----------
+        arrays
+            What `StreamScale.arrays` returned.
+
+        Returns
+        -------
+        StreamScale
+            Without the calibration episodes' largest values.
+        """
         limits = StreamLimits(*(arrays[f.name] for f in fields(StreamLimits)))
         return cls(limits, arrays["start"], arrays["per_unit"], ParetoTail(*arrays["tails"]))
 

@@ -76,12 +76,29 @@ class VoiceCosts:
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> Self:
-        """Return what `values` returned; raise what Python raises for another form."""
+        """Read what `values` returned; raise what Python raises for another form.
+
+        Parameters
+        ----------
+        values
+            By name of an attribute.
+
+        Returns
+        -------
+        VoiceCosts
+            Equal to those whose values these are.
+        """
         alone = {str(name): VoiceCost(*map(float, cost)) for name, cost in values["alone"].items()}
         return cls(float(values["level"]), VoiceCost(*map(float, values["together"])), alone)
 
     def values(self) -> dict[str, Any]:
-        """Return all as values that JSON knows."""
+        """Return all as values that JSON knows.
+
+        Returns
+        -------
+        dict of str to object
+            By name of an attribute.
+        """
         return asdict(self)
 
     def __str__(self) -> str:
