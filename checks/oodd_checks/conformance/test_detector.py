@@ -42,13 +42,13 @@ from oodd_eval.plugins.contract import (
     StreamingDetector,
     check_scores,
     copied,
-    difference,
     takes_progress,
 )
 from oodd_eval.plugins.explanations import FLIPPED, Explanation, checked_explanation, explains
 from oodd_eval.plugins.isolation.worker import reason_of
 from oodd_eval.plugins.parameters import parameters_of
 from oodd_eval.plugins.state import PackedState, pack, read_state, write_state
+from oodd_eval.results.evaluate import difference
 
 __all__ = ["shared_trial", "trial"]  # fixtures
 

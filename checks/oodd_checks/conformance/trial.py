@@ -29,11 +29,11 @@ from oodd_eval.plugins.contract import (
     DetectorSpec,
     Scores,
     accepted,
-    difference,
     factory_of,
     float_scores,
 )
 from oodd_eval.plugins.isolation.worker import reason_of
+from oodd_eval.results.evaluate import difference
 
 SENSORS: Final = 3
 ACTIONS: Final = 2
