@@ -8,16 +8,23 @@ Then they are shuffled, split into parts of the same sizes and judged anew, whic
 printed is the mean share and how many standard errors it is above the level; ``--shuffles 0``
 leaves that out. Exit code 1 where that is more than 3. A detector that adapts learns from the
 baseline rows by itself; from the others they are taken off.
+
+Those figures are of scores alone. Before them stand the alarms that people get, in which faults of
+the stream join, of the split as it was imported: of a run, and of a watchdog that is fitted on the
+same environment and handed the rows one at a time. Both are the same, or the exit code is 1.
 """
 
 import argparse
 import sys
+import warnings
 
 import numpy as np
 
-from oodd_eval import load_split
+from oodd_live import Watchdog
+
+from oodd_eval import evaluate, load_split
 from oodd_eval.data.baseline import Baseline
-from oodd_eval.errors import OoddError
+from oodd_eval.errors import OoddError, PromiseWarning
 from oodd_eval.metrics.alarms import Calibration, rolling_rules
 from oodd_eval.metrics.promise import drift_test
 from oodd_eval.plugins.contract import make_detector, score_chunk
@@ -81,6 +88,18 @@ def shuffled_share(spec, parts, level, rows, shuffles):
     # Equal shares tell nothing of their spread; a promise that is kept has at least the binomial's.
     error = max(spread, np.sqrt(level * (1 - level) / (shuffles * len(parts[2]))))
     return np.mean(shares), (np.mean(shares) - level) / error
+
+
+def alarms_of_people(name, split, data, level):
+    """Return how many nominal test episodes alarm in a run, and in a watchdog's replay."""
+    metric = f"false_episodes_at_{100 * level:g}pct"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PromiseWarning)
+        record = evaluate(name, split, environments=data.id)[0]
+        watchdog = Watchdog.fit(name, data, alpha=level)
+    episodes = list(data.twins)
+    live = sum(any(reading.alarm for reading in watchdog.replay(x)) for x in episodes)
+    return round(record.metrics[metric].value * len(episodes)), live, len(episodes)
 
 
 def report(name, parts, rows, specs, level, shuffles):
