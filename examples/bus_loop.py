@@ -24,6 +24,8 @@ from oodd_eval import load_split
 from oodd_eval.errors import OoddError
 
 RATE = 50
+NAMING = 10
+"""Rows after an alarm in which a fault may still get its name."""
 FAULTS = ("silent", "stuck", "nan", "skipping")
 PARAMETERS = {"panel": {"forecast": "linear"}}
 """Of the default, which would train networks for most of a minute otherwise."""
@@ -81,7 +83,7 @@ class Robot:
 
 
 def main(arguments=None):
-    """Watch one episode; return the reading that raised the alarm, or None."""
+    """Watch one episode; return the reading that names what is at fault, or None."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument(
         "--detector", default="panel", help="of `oodd-eval list detectors` (default: panel)"
@@ -124,7 +126,9 @@ def main(arguments=None):
             reading = watchdog.update(readings or None, robot.command, time=robot.t / RATE)
             if shown:
                 shown.update(reading)
-            if reading.alarm or robot.over:
+            # The alarm comes first, and what the sensor does has a name some rows later.
+            named = reading.alarm and (reading.faults or reading.t >= watchdog.raised.t + NAMING)
+            if named or robot.over:
                 break
             robot.step()
             left = start + (tick + 1) / RATE - time.monotonic()
@@ -132,7 +136,7 @@ def main(arguments=None):
             if not options.fast and left > 0:
                 time.sleep(left)
     print(f"{reading}; {late} of {tick + 1} ticks took longer than {1000 // RATE} ms")
-    return watchdog.raised
+    return reading if reading.alarm else None
 
 
 if __name__ == "__main__":
