@@ -197,7 +197,7 @@ def ur3(root):
     seconds = [s + 30 * (s >= 800) for s in range(1600)]
     numbers = draw(0, len(seconds), 19)
     stops = {*range(30, 34), *range(900, 911)}
-    grips = {*range(105, 107), *range(1000, 1005)}
+    grips = {*range(110, 112), *range(1000, 1005)}
     numbers[sorted(stops), 0] += 20
     body = []
     for i, s in enumerate(seconds):
@@ -236,7 +236,7 @@ def lerobot(root):
     folder = root / "data" / "chunk-000"
     folder.mkdir(parents=True)
     for i in range(10):
-        rows = 60 + i
+        rows = 160 + i
         states = draw(i, rows, 26).astype(np.float32)
         columns = {
             "observation.state": pa.array(states.tolist(), pa.list_(pa.float32(), 26)),

@@ -39,9 +39,10 @@ SETS = {
     "cwru": (12000, (6, 4, 5), {"inner-race": 2, "ball": 2}, {"ball": [[(0, 1200)]] * 2}),
     # 157 windows of half a day, five of which have rows of each label.
     "nab": (1 / 300, (55, 41, 41), {"failure": 20}, {}),
-    # Two pieces of 799 s, 39 windows each, some with a stop or a lost grip, none with both.
-    "ur3": (1, (26, 30, 18), {"protective-stop": 2, "grip-lost": 2},
-            {"protective-stop": [[(10, 14)], [(0, 11)]]}),
+    # Two pieces of 799 s, 39 windows each, some with a stop or a lost grip, none with both. Those
+    # that begin with one have no nominal beginning and are left out.
+    "ur3": (1, (26, 30, 18), {"protective-stop": 1, "grip-lost": 1},
+            {"protective-stop": [[(10, 14)]]}),
     "lerobot": (30, (4, 4, 2), {}, {}),
     # Failures are known by their outcome alone; tasks are shared out each for itself.
     "pi0": (None, (2 * 16, 2 * 14, 2 * 10), {"failure": 2 * 10}, {"failure": [[]] * 20}),
@@ -115,7 +116,7 @@ def test_columns_and_names_of_some_sets(imported):
     assert imported("nab")[1].labelled("failure").intervals[0] == ((2126 - 14 * 144, 144),)
     # The last row's action led to nothing that was recorded.
     first = imported("lerobot")[1].train[0]
-    assert (first.observations.shape, first.actions.shape) == ((60, 26), (59, 26))
+    assert (first.observations.shape, first.actions.shape) == ((160, 26), (159, 26))
     assert {*imported("pi0")[1].labelled("failure").tasks} == {"0", "2"}
 
 
