@@ -35,19 +35,21 @@ from committed import (
     overview,
     primary,
     ranking,
-    reported,
 )
 from oodd_leaderboard.pages import documents
 
 from oodd_eval.cli.main import main as oodd_eval
 from oodd_eval.data.files import read_text
 from oodd_eval.results.board import Board, boards
-from oodd_eval.results.directory import ResultsDirectory
+from oodd_eval.results.directory import ResultsDirectory, read_records
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.strengths import DETECTION, Strengths
 from oodd_eval.results.tables import Tables
 
 PAGES = (README, RESULTS)
+
+MAIN = Path(__file__).with_name("main.jsonl.xz")
+"""Records of the README's main command: ``records.jsonl`` of its results."""
 LOGS = ("skab", "alfa", "rosa", "tep", "nab", "uci", "ur3", "pi0-libero")
 """Sets of public logs that have anomalous episodes, in the order of columns."""
 
@@ -291,13 +293,10 @@ def printed(*arguments: str) -> str:
 
 
 def in_output(readme: str) -> Iterator[str]:
-    """Yield a line where the README's main command prints something else of committed records."""
+    """Yield a line where the README's main command prints something else of its records."""
     command = readme.partition("<!-- command: main -->")[2]
-    detectors = re.search(r"--detector (\S+)", command)[1].split(",")
-    records = [r for r in reported("mini") if str(r.setting) in detectors and r.seed == 0]
     with TemporaryDirectory() as directory:
-        in_order = sorted(records, key=lambda record: detectors.index(record.detector))
-        ResultsDirectory(Path(directory)).merge_records(in_order)
+        ResultsDirectory(Path(directory)).merge_records(read_records(MAIN))
         text = printed("show", "--stored", directory)
     if not text.startswith(command.partition("```text\n")[2].partition("```")[0]):
         yield f"README.md: the main command prints\n{text}"
