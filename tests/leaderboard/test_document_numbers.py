@@ -39,7 +39,7 @@ def test_another_output_of_the_readmes_command_is_seen(monkeypatch):
     readme = tables.README.read_text(encoding="utf-8")
     command = readme.partition("<!-- command: main -->")[2]
     shown = command.partition("```text\n")[2].partition("```")[0]
-    monkeypatch.setattr(tables, "reported", lambda _: [])
+    monkeypatch.setattr(tables, "read_records", lambda _: [])
     monkeypatch.setattr(tables, "printed", lambda *_: f"{shown}further tables")
     assert [*tables.in_output(readme)] == []
     monkeypatch.setattr(tables, "printed", lambda *_: shown.replace("1", "2", 1))
