@@ -216,15 +216,6 @@ def between_seeds() -> list[str]:
     return [first, f"{most:.1f}", next_to_it, f"{second:.1f}", f"{third:.1f}"]
 
 
-def found_by_seed(split: str, row: str, environment: str) -> list[str]:
-    """Return what a row finds within 20 steps in an environment in per cent, by detector seed."""
-    records = [r for r in board(split).records
-               if (r.setting, r.environment) == (Setting(row), environment)]  # fmt: skip
-    found = "found_within_20_at_5pct"
-    return [f"{100 * np.mean([r.value(found) for r in records if r.seed == s]):.1f}"
-            for s in (0, 1, 2)]  # fmt: skip
-
-
 RECENT = ("rpt-a", "logpzo-a", "wm-kl-a")
 """Networks of recent papers that see actions."""
 STEPS = ("rf", "riqn-r", "riqn-ms", "npn")
@@ -237,9 +228,6 @@ EASIER = "sensor-above-dynamics-models"
 
 
 SENTENCES: list[tuple[str, Callable[[], Iterable[Any]]]] = [
-    (("With it `panel` finds {} % of the anomalies in Acrobot within 20 steps, with the two others "
-      "{} and {} %."),
-     lambda: found_by_seed("mini", "panel", "acrobot")),
     ("`rf` gains {} points of matched AUC there, `riqn-r` {}, `riqn-ms` {} and `npn` {}.",
      lambda: gains(10, ROBOTS, STEPS)),
     ("`panel-a` falls by {} points and `panel` by {}.",
