@@ -240,7 +240,7 @@ def counted(count: Any, happened: Any) -> Any:
 
 
 class _Counts(NamedTuple):
-    """What is counted in the rows of an episode."""
+    """Counts of faults in the rows of an episode."""
 
     # `by_sensor` yields sensors with counts of the first four kinds, (4, R, sensors).
 

@@ -655,7 +655,7 @@ class ScoredEpisode:
 
     @property
     def judged(self) -> Floats:
-        """What alarms are of by row."""
+        """The statistic that alarms watch, by row."""
         return self.scores if self.statistics is None else self.statistics
 
     @property

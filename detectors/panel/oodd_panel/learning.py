@@ -1,7 +1,7 @@
-"""Whether a detector should learn an episode from its first rows.
+"""Decides whether a detector learns an episode from its first rows.
 
 A payload, a gain or a wind that is drawn for every episode is worth learning. A fault that begins
-in the rows that are learnt from is learnt, too, and found no more. So learning must forecast
+in the rows that are learnt from is learnt, too, and no longer found. So learning must forecast
 nominal episodes better that were left out, and find faults better that were put into them early.
 """
 
