@@ -8,13 +8,15 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from oodd_logs.importing import import_frames
+    from oodd_logs.kinds import Kind
     from oodd_logs.readers import Reader
     from oodd_logs.recording import Recording, Topic
     from oodd_logs.scanning.scan import scan_episodes
 
-__all__ = ["Reader", "Recording", "Topic", "import_frames", "scan_episodes"]
+__all__ = ["Kind", "Reader", "Recording", "Topic", "import_frames", "scan_episodes"]
 
 _HOMES = {
+    "Kind": "kinds",
     "Reader": "readers",
     "Recording": "recording",
     "Topic": "recording",

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from oodd_eval.errors import TrajectoryError
 from oodd_eval.names import check_known
+from oodd_logs.ledger import Ledger
 
 Column = NDArray[Any]
 """Cells of one column: float64 with NaN for what is missing, or fixed-width text (kind ``U``)."""
@@ -104,12 +105,16 @@ class Recording:
         Values that hold for the whole recording, by name: outcome, task, seed and the like. Those
         that the project's own layouts define are ``onset``, ``seed``, ``terminated`` and
         ``parameters``.
+    ledger
+        What the reader left out or changed when it opened the recording. What becomes of rows is
+        added by those who read them.
     """
 
     name: str
     source: str
     topics: Mapping[str, Topic]
     fields: Mapping[str, Any] = field(default_factory=dict)
+    ledger: Ledger = field(default_factory=Ledger)
 
 
 def parse_times(column: Column, unit: str = "") -> NDArray[np.float64]:

@@ -22,6 +22,7 @@ OFFER_HOOKS: Final = (
     "oodd_detectors",
     "oodd_environments",
     "oodd_anomalies",
+    "oodd_kinds",
     "oodd_readers",
     "oodd_detector_from_spec",
 )
@@ -91,6 +92,19 @@ def oodd_readers() -> list[Any] | None:
     Returns
     -------
     list of oodd_logs.Reader
+        None stands for an empty list.
+    """
+
+
+@hookspec
+def oodd_kinds() -> list[Any] | None:
+    """Offer kinds of columns of logs: how they are recognised, named in recipes and converted.
+
+    Called as `oodd_readers` is, and has to be as quick.
+
+    Returns
+    -------
+    list of oodd_logs.Kind
         None stands for an empty list.
     """
 

@@ -150,8 +150,8 @@ def costs_of_voices(
     nominal = [*first_rows(episodes)] if isinstance(detector, VoicedDetector) else []
     faults = [*injected_faults(nominal, start)]
     said = [_voices(detector, x) for x in (*nominal, *(x for x, _ in faults))]
-    offered = offered_levels(len(nominal), kind).values()
-    level = level or min((x for x in offered if x >= LEVELS[HEADLINE]), default=None)
+    offered = {x for x in offered_levels(len(nominal), kind).values() if x >= LEVELS[HEADLINE]}
+    level = level or min(offered, default=None)
     if not faults or level is None:
         return None
 
@@ -163,10 +163,9 @@ def costs_of_voices(
         hits = [t is not None and t >= onset for t, (_, onset) in zip(firsts, faults, strict=True)]
         return VoiceCost(rule.threshold, sum(hits) / len(hits))
 
-    names = [*said[0]]
-    if math.isinf((together := cost(names)).threshold):
+    if math.isinf((together := cost([*said[0]])).threshold):
         return None
-    return VoiceCosts(level, together, {name: cost([name]) for name in names})
+    return VoiceCosts(level, together, {name: cost([name]) for name in said[0]})
 
 
 def first_rows(episodes: Iterable[Trajectory]) -> Iterator[Trajectory]:
@@ -187,8 +186,7 @@ def injected_faults(
     One or two sensors are stuck, shifted or noisy, the same ones in every call. None begins before
     row `start`.
     """
-    usable = [x for x in nominal if len(x) >= start + 8]  # that have a row before the fault
-    if not usable:
+    if not (usable := [x for x in nominal if len(x) >= start + 8]):  # with a row before the fault
         return
     rng = np.random.default_rng(0)
     spread = np.concatenate([x.observations for x in usable]).std(axis=0, dtype=np.float64)
@@ -211,6 +209,5 @@ def injected_faults(
 def _voices(detector: Any, episode: Trajectory) -> dict[str, Scores]:
     voices = {str(n): float_scores(x, "voices") for n, x in detector.voices(episode).items()}
     if (shapes := {rows.shape for rows in voices.values()}) != {(len(episode),)}:
-        expected = f"expected ({len(episode)},): one statistic per observation"
-        raise ContractError(f"voices returned arrays of shapes {sorted(shapes)}, {expected}")
+        raise ContractError(f"voices have shapes {sorted(shapes)}, expected ({len(episode)},)")
     return voices

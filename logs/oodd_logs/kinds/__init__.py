@@ -1,0 +1,156 @@
+"""Kinds of columns: what the cells of logs may mean, and what is made of them.
+
+Every module of this package that has a `Kind` named ``KIND`` adds one; plug-ins add others by the
+hook ``oodd_kinds``. A kind tells by which columns it is recognised, in which words ``data inspect``
+says so, which line of a recipe it writes, and how it converts what it is about.
+"""
+
+import functools
+import importlib
+import pkgutil
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oodd_eval.data.facts import NAME_PATTERN, Quantity
+from oodd_eval.errors import PluginError
+from oodd_logs.recording import Column
+
+Matrix = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Conversion:
+    """How some sensors become others.
+
+    Parameters
+    ----------
+    inputs
+        Positions of the sensors among all, in the order in which `make` takes them.
+    outputs
+        Names and units of what stands in their place, where the first of them stood.
+    make
+        Called at the beginning of each recording; returns a function that takes rows of shape
+        (R, inputs), block after block of the recording, and returns rows of shape (R, outputs).
+    """
+
+    inputs: tuple[int, ...]
+    outputs: tuple[Quantity, ...]
+    make: Callable[[], Callable[[Matrix], Matrix]]
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """A kind of columns.
+
+    A kind needs `name` and `words`, and those functions that its stage takes: `flatten` for values
+    in messages, `read` for texts in cells, `recognise` and `convert` for columns of numbers.
+
+    Parameters
+    ----------
+    name
+        Lower-case letters, digits and hyphens.
+    words
+        Says of columns that are of the kind what they are and what to write: ``{names}`` stands for
+        their names, ``{line}`` for the line of the recipe.
+    key
+        Key of recipes that lists columns of the kind; empty where a recipe says nothing of them.
+    recognise
+        Called with facts of columns by name (`oodd_logs.inspection.columns.ColumnFacts`); returns
+        the value that `key` would have in a recipe, by names of columns: a tuple of several where
+        they belong together. None where it is not told by numbers.
+    check
+        Called with what messages call the key and its value in a recipe; returns the value, or
+        raises `UsageError` with what is expected.
+    convert
+        Called with the value of the key and the sensors; returns its conversions.
+    read
+        Called with texts of a column that are no numbers; returns the numbers of those that the
+        kind knows, by their text, NaN for what is missing.
+    flatten
+        Called with the name of a value in a message, or row of objects, and the value; returns
+        pairs of names and values in its place, which are looked at again, or None for a value of
+        another kind.
+    """
+
+    name: str
+    words: str
+    key: str = ""
+    recognise: Callable[[Mapping[str, Any]], Mapping[str | tuple[str, ...], Any]] | None = None
+    check: Callable[[str, Any], Any] | None = None
+    convert: Callable[[Any, Sequence[Quantity]], Sequence[Conversion]] | None = None
+    read: Callable[[Sequence[str]], Mapping[str, float]] | None = None
+    flatten: Callable[[str, Any], Iterable[tuple[str, Any]] | None] | None = None
+
+
+def kinds() -> Mapping[str, Kind]:
+    """Return the kinds by name: the project's, and those of plug-ins that were registered."""
+    return MappingProxyType({**_ours(), **_registered})
+
+
+def kinds_by_key() -> Mapping[str, Kind]:
+    """Return the kinds that recipes list columns of, by the key of recipes."""
+    return MappingProxyType({kind.key: kind for kind in kinds().values() if kind.key})
+
+
+def register_kinds(offered: Iterable[Kind]) -> None:
+    """Make kinds of plug-ins known in this process; `check_kind` says which may be."""
+    for kind in offered:
+        check_kind(kind)
+        _registered[kind.name] = kind
+
+
+def check_kind(kind: Kind) -> None:
+    """Raise `PluginError` for a kind with a wrong name or key, or one that the project has."""
+    if not re.fullmatch(NAME_PATTERN, str(kind.name)) or kind.name in _ours():
+        raise PluginError(
+            f"{kind.name!r} cannot be the name of a kind of columns, expected lower-case letters, "
+            f"digits and hyphens, and none of {', '.join(_ours())}"
+        )
+    if kind.key and (kind.check is None or kind.convert is None):
+        raise PluginError(f"kind {kind.name!r} has the key {kind.key!r}, but no check and convert")
+
+
+def flattened(name: str, value: Any) -> Iterator[tuple[str, Any]] | None:
+    """Return what a kind makes of a value in a message; None where none knows it."""
+    for kind in kinds().values():
+        if kind.flatten is not None and (pairs := kind.flatten(name, value)) is not None:
+            return iter(pairs)
+    return None
+
+
+def read_texts(texts: Sequence[str]) -> dict[str, float]:
+    """Return the numbers of texts that a kind knows, by text."""
+    numbers: dict[str, float] = {}
+    for kind in kinds().values():
+        if kind.read is not None and (left := [text for text in texts if text not in numbers]):
+            numbers |= kind.read(left)
+    return numbers
+
+
+@functools.cache
+def _ours() -> dict[str, Kind]:
+    modules = [
+        importlib.import_module(m.name) for m in pkgutil.iter_modules(__path__, f"{__name__}.")
+    ]
+    return {module.KIND.name: module.KIND for module in modules if hasattr(module, "KIND")}
+
+
+_registered: Final[dict[str, Kind]] = {}
+
+__all__ = [
+    "Column",
+    "Conversion",
+    "Kind",
+    "check_kind",
+    "flattened",
+    "kinds",
+    "kinds_by_key",
+    "read_texts",
+    "register_kinds",
+]

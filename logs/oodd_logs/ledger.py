@@ -1,0 +1,185 @@
+"""What became of logs on their way from files to a result: nothing leaves without a word.
+
+A `Ledger` goes from the reader through inspection, import and scan to the result. Whoever leaves
+something out, holds it or changes it adds a line; what is kept as it is needs none.
+"""
+
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final, Literal, Self
+
+from oodd_eval.names import counted
+
+Item = Literal["file", "recording", "episode", "column", "row", "cell", "mark"]
+Fate = Literal["kept", "held", "dropped", "changed"]
+
+_NAMED: Final = 6  # sources that a line of JSON lists
+_CELL: Final = 60  # characters of a cell that are quoted
+
+
+@dataclass(slots=True)
+class LedgerEntry:
+    """One thing that became of some items, for the same reason.
+
+    Parameters
+    ----------
+    item
+        What it happened to.
+    fate
+        ``"held"``: the last value stands in its place. ``"changed"``: it was read otherwise than
+        it is written. ``"kept"``: nothing was done about what may be wrong.
+    reason
+        Why, in words that end a sentence: ``"text among numbers"``.
+    name
+        Of the column, label or file that it is about; empty for the logs as a whole.
+    count
+        Number of items.
+    sources
+        Number of items by recording, or file, as messages name it.
+    row, cell
+        Row of the first of them in the first source, from 0 on, and its text; None and empty where
+        it has none.
+    """
+
+    item: Item
+    fate: Fate
+    reason: str
+    name: str = ""
+    count: int = 0
+    sources: Counter[str] = field(default_factory=Counter)
+    row: int | None = None
+    cell: str = ""
+
+    @property
+    def first(self) -> str:
+        """The first place in words, such as ``r03.csv row 60 "#N/A"``."""
+        parts = [next(iter(self.sources), "")]
+        parts += [] if self.row is None else [f"row {self.row}"]
+        parts += [f'"{self.cell}"'] if self.cell else []
+        return " ".join(filter(None, parts))
+
+    def line(self, total: int = 0) -> str:
+        """Return the entry as a line of text.
+
+        Parameters
+        ----------
+        total
+            Number of sources in all; 0 where that is not known.
+        """
+        what = f" of {self.name}" if self.name and self.item in {"cell", "row", "mark"} else ""
+        items = counted(self.count, f"{self.item}(s)")
+        if self.item in {"column", "file", "recording"} and self.name:
+            items, what = f"{self.item} {self.name}", ""
+        of_all = f" of {total}" if total else ""
+        many = f" in {len(self.sources)}{of_all}: first" if len(self.sources) > 1 else ":"
+        where = f"{many} {self.first}" if self.first else ""
+        return f"{self.fate}: {items}{what}, {self.reason}{where}"
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the entry as values for JSON."""
+        return {
+            "item": self.item,
+            "fate": self.fate,
+            "name": self.name,
+            "reason": self.reason,
+            "count": self.count,
+            "sources": len(self.sources),
+            "first": {"source": next(iter(self.sources), ""), "row": self.row, "cell": self.cell},
+            "examples": [*self.sources][:_NAMED],
+        }
+
+
+class Ledger:
+    r"""Entries about logs, each with its first place and the number of items it is about.
+
+    Examples
+    --------
+    >>> ledger = Ledger()
+    >>> ledger.add("cell", "held", "text among numbers", name="a", source="r03.csv", row=60,
+    ...            cell="#N/A")
+    >>> print(*ledger.lines(30), sep="\n")
+    held: 1 cell of a, text among numbers: r03.csv row 60 "#N/A"
+    """
+
+    def __init__(self) -> None:
+        self._entries: dict[tuple[str, ...], LedgerEntry] = {}
+
+    def add(
+        self,
+        item: Item,
+        fate: Fate,
+        reason: str,
+        *,
+        name: str = "",
+        count: int = 1,
+        source: str = "",
+        row: int | None = None,
+        cell: str = "",
+    ) -> None:
+        """Add items that share a fate; none for a count of 0.
+
+        Parameters
+        ----------
+        item, fate, reason, name, count
+            See `LedgerEntry`; items that agree in all but the count make one entry.
+        source, row, cell
+            Where the first of them is.
+        """
+        if count < 1:
+            return
+        plain = " ".join(cell.split())[:_CELL]
+        entry = self._entries.setdefault(
+            (item, fate, name, reason), LedgerEntry(item, fate, reason, name, row=row, cell=plain)
+        )
+        entry.count += count
+        entry.sources[source] += count
+
+    def merge(self, other: Self, source: str | None = None) -> None:
+        """Add the entries of another ledger.
+
+        Parameters
+        ----------
+        other
+            The ledger.
+        source
+            Recording that all of them are about, in place of their sources.
+        """
+        for e in other:
+            row, cell = e.row, e.cell
+            for name, count in e.sources.items():
+                where = name if source is None else source
+                values: Mapping[str, Any] = {"name": e.name, "count": count, "source": where}
+                self.add(e.item, e.fate, e.reason, row=row, cell=cell, **values)
+
+    def __iter__(self) -> Any:
+        return iter(self._entries.values())
+
+    def __bool__(self) -> bool:
+        return bool(self._entries)
+
+    def of(self, item: Item, fate: Fate | None = None) -> list[LedgerEntry]:
+        """Return the entries about items of a sort, with any fate by default."""
+        return [e for e in self if e.item == item and fate in {None, e.fate}]
+
+    def lines(self, total: int = 0) -> list[str]:
+        """Return the entries as lines of text, in the order in which they came.
+
+        Parameters
+        ----------
+        total
+            Number of recordings in all; 0 where that is not known.
+        """
+        return [entry.line(total) for entry in self]
+
+    def as_json(self) -> list[dict[str, Any]]:
+        """Return the entries as values for JSON."""
+        return [entry.as_json() for entry in self]
+
+    @classmethod
+    def joined(cls, ledgers: Iterable[Self]) -> Self:
+        """Return one ledger with the entries of several."""
+        ledger = cls()
+        for other in ledgers:
+            ledger.merge(other)
+        return ledger
