@@ -427,13 +427,24 @@ def test_the_command_prints_and_writes_a_recipe_that_is_read(
     assert Recipe.load(elsewhere).nominal.files == ("*.csv",)
 
 
+def test_a_cell_of_text_is_the_exception_of_its_file(clean):
+    logs = with_columns(
+        clean, odd=lambda rows, i: ["broken" if (i, k) == (3, 7) else k % 7 for k in range(rows)]
+    )
+    recipe = Recipe.parse(tomllib.loads(draft(logs)))
+    assert ("odd" in recipe.sensors, recipe.missing) == (True, "hold")
+    (entry,) = logs.ledger.of("cell", "held")
+    assert (entry.name, entry.row, entry.cell, entry.count) == ("odd", 7, "broken", 1)
+    assert entry.first in describe_logs(logs)
+
+
 @pytest.mark.parametrize(
     ("rows", "text", "advised"), [(300, False, "--window=15"), (3, False, ""), (300, True, "")]
 )
 def test_the_command_advises_only_scans_that_work(tmp_path, capsys, rows, text, advised):
     columns = times(rows) | {"q": process(rows)["q[rad]"]}
     if text:
-        columns["q"] = ["err" if i % 50 == 0 else x for i, x in enumerate(columns["q"])]
+        columns["q"] = ["err" if i % 2 == 0 else x for i, x in enumerate(columns["q"])]
     write(tmp_path / "logs" / "run.csv", columns)
     assert main(["data", "inspect", str(tmp_path / "logs")]) == 0
     out = " ".join(capsys.readouterr().out.split())

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from oodd_eval.data.offsets import RunningMoments, is_coarse
 from oodd_eval.errors import TrajectoryError
 from oodd_logs.marks import runs_of
+from oodd_logs.readers.cells import mixed
 from oodd_logs.recording import Column, parse_times
 from oodd_logs.stamps import Steps
 
@@ -41,8 +42,8 @@ class ColumnFacts:
         Number of cells, and of those without a value.
     leading, longest
         Most missing cells at the start of a recording, and the longest run of them behind that.
-    text
-        Whether any cell is text.
+    words
+        By recording, the number of cells that are text, the row of the first, and that.
     numbers
         Range, mean and spread of the numbers.
     values
@@ -51,8 +52,9 @@ class ColumnFacts:
         Number of differences between neighbouring rows, and of those below and above zero.
     jumps, wild
         For each of `PERIODS`, steps of nearly that size, and others of more than an eighth of it.
-    run, at_start, last
-        Missing cells before the next one, whether there was none but these, and the last number.
+    source, run, at_start, last
+        The recording, its missing cells before the next one, whether there was none but these, and
+        its last number.
     """
 
     recordings: int = 0
@@ -60,7 +62,7 @@ class ColumnFacts:
     missing: int = 0
     leading: int = 0
     longest: int = 0
-    text: bool = False
+    words: dict[str, tuple[int, int, str]] = field(default_factory=dict)
     numbers: RunningMoments = field(default_factory=RunningMoments)
     values: Counter[float | str] | None = field(default_factory=Counter)
     steps: int = 0
@@ -68,29 +70,43 @@ class ColumnFacts:
     rises: int = 0
     jumps: list[int] = field(default_factory=lambda: [0] * len(PERIODS))
     wild: list[int] = field(default_factory=lambda: [0] * len(PERIODS))
+    source: str = ""
     run: int = 0
     at_start: bool = True
     last: float = math.nan
 
-    def begin(self) -> None:
+    def begin(self, source: str = "") -> None:
         """Say that the next cells are of another recording."""
         self.recordings += 1
-        self.run, self.at_start, self.last = 0, True, math.nan
+        self.source, self.run, self.at_start, self.last = source, 0, True, math.nan
 
     def leap(self) -> None:
         """Say that rows before the next cells were left out."""
         self.run, self.at_start, self.last = 0, False, math.nan
 
-    def add(self, cells: Column) -> None:
-        """Take the next cells of the recording."""
-        absent = np.isnan(cells) if cells.dtype.kind == "f" else np.char.str_len(cells) == 0
+    def add(self, cells: Column, start: int = 0) -> None:
+        """Take the next cells of the recording, from some row on."""
+        numbers = cells
+        if cells.dtype.kind == "U":
+            numbers, words = mixed(cells)
+            if words.any():
+                first = int(words.argmax())
+                place = 0, start + first, str(cells[first])
+                count, row, word = self.words.get(self.source, place)
+                self.words[self.source] = (count + int(words.sum()), row, word)
+            if 2 * words.sum() >= len(cells) - (np.isnan(numbers) & ~words).sum():
+                absent = np.strings.str_len(cells) == 0
+                self.cells += len(cells)
+                self._count_missing(absent)
+                self._count_values(cells[~absent])
+                return
+            self._count_values(cells[words])
+        absent = np.isnan(numbers)
         self.cells += len(cells)
         self._count_missing(absent)
-        present = cells[~absent]
+        present = numbers[~absent]
         self._count_values(present)
-        if present.dtype.kind == "U":
-            self.text = self.text or bool(len(present))
-        elif len(present):
+        if len(present):
             self.numbers.add(present)
             self._count_steps(present)
 
@@ -130,6 +146,12 @@ class ColumnFacts:
             jumps = np.abs(sizes - period) < 0.08 * period
             self.jumps[i] += int(jumps.sum())
             self.wild[i] += int((sizes > period / 8).sum() - jumps.sum())
+
+    @property
+    def text(self) -> bool:
+        """True if at least half of the cells with a value are text."""
+        words = sum(count for count, *_ in self.words.values())
+        return words > 0 and words >= self.numbers.count
 
     @property
     def empty(self) -> bool:

@@ -15,6 +15,7 @@ from oodd_eval.data.files import lies_in
 from oodd_eval.errors import TrajectoryError, UsageError
 from oodd_eval.names import check_known
 from oodd_logs.inspection.columns import FEW, ClockFacts, ColumnFacts, parse_dates, time_unit
+from oodd_logs.ledger import Ledger
 from oodd_logs.readers import NO_OPTIONS, Options, Reader, in_order, readers
 from oodd_logs.recording import Column, Recording, Topic
 
@@ -112,6 +113,8 @@ class Inspection:
         Number of files of other formats, by ending.
     problems, unreadable
         What could not be read, and the files that it is in.
+    ledger
+        What was left out, or is not as in most of the logs.
     """
 
     path: Path
@@ -127,6 +130,7 @@ class Inspection:
     others: Counter[str] = field(default_factory=Counter)
     problems: list[str] = field(default_factory=list)
     unreadable: list[str] = field(default_factory=list)
+    ledger: Ledger = field(default_factory=Ledger)
 
     @property
     def topics(self) -> tuple[str, ...]:
@@ -176,7 +180,7 @@ class Inspection:
             numbers = [value for value in values if not isinstance(value, str)]
             partial = facts.recordings < len(self.recordings) and 0.0 in values
             often = partial or values.get(0.0, 0) > facts.cells / 4
-            fits = facts.text or (often and all(x == round(x) for x in numbers))
+            fits = bool(facts.words) or (often and all(x == round(x) for x in numbers))
             says_so = _LABEL.search(name.removeprefix(self.topic_of(name)))
             if facts.flag and fits and (partial or says_so):
                 candidates.append((len(values) > 2, facts.missing > 0, not facts.text, name))
@@ -184,6 +188,8 @@ class Inspection:
 
     def add(self, recording: Recording, file: str) -> None:
         """Read the rows of a recording in blocks and keep what is in them."""
+        folder = self.path if self.path.name != file else self.path.parent
+        source = recording.source.removeprefix(f"{folder}/")
         columns: dict[str, ColumnFacts] = {}
         before: dict[str, Counter[float | str]] = {}
         clocks: dict[str, ClockFacts] = {}
@@ -195,7 +201,7 @@ class Inspection:
             for name in (f"{below}{name}" for name in topic.names):
                 columns[name] = self.columns.setdefault(name, ColumnFacts())
                 before[name] = Counter(columns[name].values or {})
-                columns[name].begin()
+                columns[name].begin(source)
             stamps: dict[str, list[tuple[int, NDArray[np.float64]]]] = {}
             dated: dict[str, bool] = {}
             hashed: list[str] = []
@@ -211,7 +217,7 @@ class Inspection:
                 for name, cells in block.items():
                     if start != following:
                         columns[f"{below}{name}"].leap()
-                    columns[f"{below}{name}"].add(cells)
+                    columns[f"{below}{name}"].add(cells, start)
                     digest.update(cells.tobytes())
                 for name in hashed:
                     rows = rows * _PRIME ^ np.ascontiguousarray(block[name]).view(np.uint64)
@@ -227,6 +233,7 @@ class Inspection:
             for name, blocks in stamps.items():
                 if clock := ClockFacts.of(blocks, dated=dated[name]):
                     clocks[f"{below}{name}"] = clock
+        self.ledger.merge(recording.ledger, source)
         self.recordings.append(
             RecordingFacts(
                 recording.name,
@@ -322,6 +329,10 @@ def inspect_logs(
     shared = Counter(r.file for r in result.recordings if len(by_digest[r.digest]) > 1)
     result.shared = {file: n for file, n in shared.items() if file not in equal}
     result.continued = _continued(result.recordings)
+    for name in [n for n, c in result.columns.items() if not c.text and n not in result.labels]:
+        for source, (count, row, cell) in result.columns[name].words.items():
+            values: dict[str, Any] = {"name": name, "count": count, "source": source, "row": row}
+            result.ledger.add("cell", "held", "text among numbers", cell=cell, **values)
     return result
 
 

@@ -98,9 +98,9 @@ def keys_of_fields(logs: Inspection) -> dict[str, str]:
 def nominal_values(logs: Inspection, label: str) -> tuple[float | str, ...]:
     """Return the values of a label that are nominal."""
     values: Mapping[float | str, int] = logs.columns[label].values or {}
-    if not logs.columns[label].text:
+    if not logs.columns[label].text and 0.0 in values:
         return (0.0,)
-    words = [v for v in values if v in {"H", "0"} or NOMINAL_WORDS.search(str(v))]
+    words = [v for v in values if v in {"H", "0", 0.0} or NOMINAL_WORDS.search(str(v))]
     return tuple(words) or (max(values, key=lambda v: values[v]),)
 
 
@@ -234,7 +234,7 @@ def cuts_of(logs: Inspection) -> tuple[int, int]:
 def lacks_values(name: str, facts: ColumnFacts) -> bool:
     """Tell whether values are missing, other than commands after the last observation."""
     after = name.startswith(("action:", "reward")) and facts.missing <= facts.recordings
-    return facts.missing > 0 and not facts.constant and not after
+    return bool(facts.missing or facts.words) and not facts.constant and not after
 
 
 def _key_of(name: str, counts: Counter[Any]) -> str:

@@ -288,7 +288,8 @@ def describe_logs(logs: Inspection, width: int = 80) -> str:
     if len(logs.topics) > 1:
         parts.append(_topic_table(logs))
     parts.append(_column_table(logs, width))
-    if advice := advise(logs):
+    advice = [*advise(logs), *(Advice("ledger", line) for line in logs.ledger.lines(files))]
+    if advice:
         indent = max(len(topic) for topic, _ in advice) + 2
         wrapper = textwrap.TextWrapper(min(width, 110), break_on_hyphens=False)
         wrapper.subsequent_indent = " " * indent

@@ -1,18 +1,22 @@
 """Cells of text: numbers, truth values, what is missing, and names of columns."""
 
+import contextlib
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from oodd_eval.data.bounded import EPISODE
 from oodd_eval.errors import TrajectoryError
 from oodd_eval.names import is_plain
+from oodd_logs.kinds import read_texts
 from oodd_logs.recording import MISSING, Column
 
 _TRUTHS: Final = {"true": 1.0, "false": 0.0}
+_PROBED: Final = 500  # cells of which one is a number where a column has some
 _KINDS: Final = {
     "obs": "obs",
     "observation": "obs",
@@ -76,6 +80,32 @@ def numbers(cells: Sequence[str], decimal: str = ".") -> Column | None:
     except ValueError:
         return None
     return np.fromiter(map(values.__getitem__, cells), np.float64, len(cells))
+
+
+def mixed(cells: Column) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return the numbers of a column of texts, NaN elsewhere, and which cells are other texts.
+
+    Cells without a value are neither. Kinds of columns say which other texts are numbers.
+
+    >>> mixed(np.array(["1.5", "", "open", "nan", "2,5"]))
+    (array([1.5, nan, nan, nan, 2.5]), array([False, False,  True, False, False]))
+    """
+    every = cells.tolist()
+    if not any(_number_of(cell) is not None for cell in every[:: max(1, len(every) // _PROBED)]):
+        return np.full(len(cells), np.nan), np.strings.str_len(cells) > 0
+    values = {cell: _number_of(cell) for cell in {*every}}
+    others = [cell for cell, value in values.items() if value is None]
+    values |= read_texts(others)
+    column = [values[cell] for cell in every]
+    words = np.array([value is None for value in column], np.bool_)
+    return np.array(column, np.float64), words
+
+
+def _number_of(cell: str) -> float | None:
+    for decimal in ".,":
+        with contextlib.suppress(ValueError):
+            return number(cell, decimal)
+    return None
 
 
 def first_text(cells: Sequence[str]) -> int:
