@@ -3,9 +3,11 @@
 Each recording is read once, and its rows wait on disk, in float64, until a part is written.
 """
 
+import contextlib
 import dataclasses
 import glob
 import itertools
+import unicodedata
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,19 +22,22 @@ from oodd_eval.data.offsets import RunningMoments, is_coarse
 from oodd_eval.data.parts import CALIBRATION, TRAIN, TWINS
 from oodd_eval.errors import TrajectoryError, UnknownNameError, UsageError
 from oodd_eval.names import check_known, counted
+from oodd_logs.ledger import Item, Ledger
 from oodd_logs.marks import AnomalousRows, IntervalList, merged, rows_of
 from oodd_logs.readers import in_order as natural_order
 from oodd_logs.readers import reader_for
 from oodd_logs.recipe import FAILURE, AnomalousFiles, Recipe, anomaly_name
 from oodd_logs.recorded import FILES, NOMINAL_ROLES, Recorded, StampedRows, text_of
 from oodd_logs.recording import Recording
-from oodd_logs.rows import Converter, Matrix, Spool, Tally, spool_stretch
+from oodd_logs.rows import Converter, Matrix, Spool, spool_stretch
 from oodd_logs.selecting import (
     ChosenColumn,
     Layout,
     Selection,
     layout_of,
     named_columns,
+    respelled,
+    respellings,
     select_columns,
 )
 from oodd_logs.stamps import Steps, Times, even_rate
@@ -40,8 +45,8 @@ from oodd_logs.stamps import Steps, Times, even_rate
 EVERY: Final = "every"
 """The part with all episodes of a source that `read_every_episode` made."""
 
-_LISTED: Final = 12  # columns without a use that are named
 _ANOMALOUS: Final = "anomalous"  # where labels name no anomaly
+_SLOWER: Final = 1.5  # times the usual step, from which on a clock is of another unit
 _BLOCK: Final = 1 << 16  # rows that are read at once
 _NO_FILES: Final = AnomalousFiles()
 _SHARED: Final = (TRAIN, CALIBRATION, TWINS)
@@ -129,10 +134,12 @@ class EpisodeSource:
         Facts of the episodes by part: ``train``, ``calibration``, ``test/nominal``, ``test/KIND``.
     groups
         Groups of the anomalies.
-    unused
-        Columns that no line of the recipe names.
+    ledger
+        What was left out, held or changed.
+    recordings
+        Number of recordings.
     notes
-        What was read and left out, a line each.
+        What was read, a line each.
     offsets
         Subtracted from each sensor; empty where nothing is.
     """
@@ -146,7 +153,8 @@ class EpisodeSource:
     rate: float | None = None
     parts: dict[str, list[EpisodeFacts]] = field(default_factory=dict)
     groups: dict[str, Group] = field(default_factory=dict)
-    unused: tuple[str, ...] = ()
+    ledger: Ledger = field(default_factory=Ledger)
+    recordings: int = 0
     notes: list[str] = field(default_factory=list)
     offsets: tuple[float, ...] = ()
 
@@ -159,6 +167,11 @@ class EpisodeSource:
     def close(self) -> None:
         """Remove the rows from disk."""
         self._spool.close()
+
+    @property
+    def summary(self) -> list[str]:
+        """The ledger in short, a line each."""
+        return self.ledger.summary([sensor.name for sensor in self.sensors], self.recordings)
 
     def rows(self, facts: EpisodeFacts, start: int, stop: int) -> Matrix:
         """Return rows of an episode.
@@ -236,11 +249,8 @@ def read_episodes(recipe: Recipe, root: Path) -> EpisodeSource:
     TrajectoryError
         When a recording cannot be read; the message names file and row.
     """
-    absent: list[str] = []
-    recordings = _recorded(recipe, root, absent)
-    source = make_episodes(recipe, recordings, IntervalList.of(recipe, root))
-    source.notes += absent
-    return source
+    reading = _Reading(recipe, IntervalList.of(recipe, root))
+    return _read(reading, _recordings(reading, _listed(reading, root)))
 
 
 def make_episodes(
@@ -263,12 +273,32 @@ def make_episodes(
 def _read(reading: "_Reading", recordings: Iterable[Recorded]) -> EpisodeSource:
     try:
         for recorded in recordings:
-            _add(reading, recorded)
+            if any(topic.rows for topic in recorded.recording.topics.values()):
+                with _scan_goes_on(reading, recorded.label):
+                    _add(reading, recorded)
+            else:
+                reading.ledger.add("file", "dropped", "no rows", source=recorded.label)
         return _in_parts(reading)
     except BaseException:
         if reading.first:
             reading.first.spool.close()
         raise
+
+
+@contextlib.contextmanager
+def _scan_goes_on(reading: "_Reading", label: str, item: Item = "recording") -> Iterator[None]:
+    """Leave out what cannot be read, where every other episode is to be read."""
+    episodes = reading.parts.get(EVERY, [])
+    count = len(episodes)
+    try:
+        yield
+    except (TrajectoryError, UsageError) as error:
+        if not reading.every:
+            raise
+        del episodes[count:]
+        reading.failures.append(error)
+        reason = str(error).replace(str(reading.root), "").strip("/")
+        reading.ledger.add(item, "dropped", reason.removeprefix(label).lstrip(",: "), source=label)
 
 
 def read_every_episode(recipe: Recipe, root: Path, files: Sequence[Path]) -> EpisodeSource:
@@ -306,13 +336,9 @@ def read_every_episode(recipe: Recipe, root: Path, files: Sequence[Path]) -> Epi
         for pattern in table.files:
             for path in names_matching(pattern, root):
                 listed.setdefault(root / path, set()).add(f"test/{name}")
-    recordings = (
-        Recorded(recording, path, path.relative_to(root).as_posix(), frozenset(roles))
-        for path in files
-        for roles in [listed.get(path, {FILES})]
-        for recording in reader_for(path, recipe.format).read(path, recipe.options)
-    )
-    return _read(_Reading(recipe, IntervalList.of(recipe, root), every=True), recordings)
+    reading = _Reading(recipe, IntervalList.of(recipe, root), every=True, root=root)
+    roles = ((path, frozenset(listed.get(path, {FILES}))) for path in files)
+    return _read(reading, _recordings(reading, roles))
 
 
 def matching_files(patterns: Sequence[str], root: Path) -> list[Path]:
@@ -335,8 +361,9 @@ def matching_files(patterns: Sequence[str], root: Path) -> list[Path]:
     return sorted(files, key=lambda path: natural_order(path.as_posix()))
 
 
-def _recorded(recipe: Recipe, root: Path, notes: list[str]) -> Iterator[Recorded]:
-    """Yield the recordings of a recipe's files, in natural order; note globs without any."""
+def _listed(reading: "_Reading", root: Path) -> Iterator[tuple[Path, frozenset[str]]]:
+    """Yield the files of a recipe in natural order with their roles."""
+    recipe, reading.root = reading.recipe, root
     tables = {
         FILES: recipe.nominal.files,
         TRAIN: recipe.nominal.train,
@@ -351,15 +378,28 @@ def _recorded(recipe: Recipe, root: Path, notes: list[str]) -> Iterator[Recorded
     for role, patterns in (tables | (there or anomalous)).items():
         for path in matching_files(patterns, root):
             roles.setdefault(path, set()).add(role)
-    if absent:
-        notes.append(f"no file matches {', '.join(absent)}")
+    for pattern in absent:
+        reading.ledger.add("file", "dropped", "no file matches", name=pattern)
     for path in sorted(roles, key=lambda path: natural_order(path.as_posix())):
         nominal_roles = roles[path] & NOMINAL_ROLES
         if len(nominal_roles) > 1:
             raise UsageError(f"{path} is in two nominal parts: {', '.join(sorted(nominal_roles))}")
+        yield path, frozenset(roles[path])
+
+
+def _recordings(
+    reading: "_Reading", files: Iterable[tuple[Path, frozenset[str]]]
+) -> Iterator[Recorded]:
+    """Yield the recordings of files with their roles."""
+    recipe, root = reading.recipe, reading.root
+    for path, roles in files:
         relative = path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)
-        for recording in reader_for(path, recipe.format).read(path, recipe.options):
-            yield Recorded(recording, path, relative, frozenset(roles[path]))
+        if path.is_file() and not path.stat().st_size:
+            reading.ledger.add("file", "dropped", "no rows", source=relative)
+            continue
+        with _scan_goes_on(reading, relative, "file"):
+            for recording in reader_for(path, recipe.format).read(path, recipe.options):
+                yield Recorded(recording, path, relative, roles)
 
 
 def names_matching(pattern: str, root: Path) -> list[str]:
@@ -392,6 +432,7 @@ def files_of(recipe: Recipe, root: Path) -> Iterator[Path]:
 class _First:
     """Columns of the first recording, which all others share, and where rows are kept."""
 
+    layout: Layout
     selection: Selection
     converter: Converter
     spool: Spool
@@ -406,16 +447,24 @@ class _Reading:
     recipe: Recipe
     intervals: IntervalList
     every: bool = False
-    tally: Tally = field(default_factory=Tally)
+    root: Path = Path()
+    ledger: Ledger = field(default_factory=Ledger)
     first: _First | None = None
+    respellings: dict[Layout, Mapping[tuple[str, str], str]] = field(default_factory=dict)
     selections: dict[Layout, Selection] = field(default_factory=dict)
+    labels: dict[Layout, list[str]] = field(default_factory=dict)  # of recordings
     parts: dict[str, list[EpisodeFacts]] = field(default_factory=dict)
     spans: list[tuple[float, float]] = field(default_factory=list)  # first and last stamps
-    steps: list[Steps] = field(default_factory=list)
-    recordings: int = 0
+    steps: dict[int, dict[str, Steps]] = field(default_factory=dict)  # by topic and recording
     names: set[str] = field(default_factory=set)
     problems: list[str] = field(default_factory=list)
+    failures: list[Exception] = field(default_factory=list)  # of what a scan leaves out
     cut_by_outcome: set[str] = field(default_factory=set)  # parts with windows without a label
+
+    @property
+    def recordings(self) -> int:
+        """Number of the recordings that were read."""
+        return sum(map(len, self.labels.values()))
 
     @property
     def shortest(self) -> int:
@@ -431,22 +480,18 @@ class _Reading:
 
 def _add(reading: _Reading, recorded: Recorded) -> None:
     """Read one recording and keep its episodes."""
-    recipe = reading.recipe
-    recorded = recorded.meeting(recipe)
-    recording = recorded.recording
+    recipe, ledger = reading.recipe, Ledger()
+    recorded = _respelled(reading, recorded, ledger).meeting(recipe)
+    recording, label = recorded.recording, recorded.label
     if not recorded.roles:
-        reading.tally.leave_out("recording(s) that meet no condition (where)")
+        reading.ledger.add("recording", "dropped", "meets no condition (where)", source=label)
         return
     selection, first = _selected(reading, recording)
-    reading.recordings += 1
-    reading.names |= {recorded.relative, recording.name}
     outcome, kind, task = _outcome_kind_and_task(recorded, recipe, lenient=reading.every)
-    stamped = StampedRows(recorded, selection, recipe, reading.tally)
+    stamped = StampedRows(recorded, selection, recipe, ledger)
     marks = stamped.marks(reading.intervals, is_anomalous=bool(kind or recorded.kinds))
     stretches, times = stamped.stretches()
-    if times:
-        reading.spans.append((min(t[0] for t in times), max(t[-1] for t in times)))
-        reading.steps += [steps for t in times if (steps := Steps.of(t)).usual]
+    number = reading.recordings
     numbers = itertools.count()
     for stretch in stretches:
         above = first.spool.rows
@@ -456,10 +501,10 @@ def _add(reading: _Reading, recorded: Recorded) -> None:
         for part, start, stop, intervals, is_piece in _cut(
             reading, recorded, kind, stretch.rows, rows, is_cut=is_cut
         ):
-            number = next(numbers)
+            piece = next(numbers)
             facts = EpisodeFacts(
                 part,
-                f"{recording.name}#{number}" if is_piece else recording.name,
+                f"{recording.name}#{piece}" if is_piece else recording.name,
                 recording.source,
                 above + start,
                 stop - start,
@@ -468,9 +513,35 @@ def _add(reading: _Reading, recorded: Recorded) -> None:
                 task,
                 *stretch.begin_and_step(start, stop),
                 recording.fields,
-                reading.recordings - 1,
+                number,
             )
-            _keep(reading, facts)
+            _keep(reading, facts, label)
+    for text in recipe.label_columns:
+        if text not in selection.labels and (text in recipe.labels or recorded.kinds):
+            ledger.add("recording", "kept", f"has no column {text!r}: rows count as nominal")
+    ledger.merge(recording.ledger)
+    reading.ledger.merge(ledger, label)
+    reading.names |= {recorded.relative, recording.name}
+    reading.labels.setdefault(layout_of(recording), []).append(label)
+    if times:
+        reading.spans.append((min(t[0] for t in times), max(t[-1] for t in times)))
+        for i, steps in enumerate(map(Steps.of, times)):
+            if steps.usual:
+                reading.steps.setdefault(i, {})[label] = steps
+
+
+def _respelled(reading: _Reading, recorded: Recorded, ledger: Ledger) -> Recorded:
+    """Return a recording whose columns have the names of the recipe, or of the first recording."""
+    layout = layout_of(recorded.recording)
+    if layout not in reading.respellings:
+        first = reading.first.layout if reading.first else None
+        reading.respellings[layout] = respellings(layout, reading.recipe, first)
+    names = reading.respellings[layout]
+    for (_, old), new in names.items():
+        is_form = unicodedata.normalize("NFC", old) == unicodedata.normalize("NFC", new)
+        spelled = ascii(old) if is_form else repr(old)
+        ledger.add("column", "changed", f"taken from {spelled}, as the file lacks it", name=new)
+    return dataclasses.replace(recorded, recording=respelled(recorded.recording, names))
 
 
 def _selected(reading: _Reading, recording: Recording) -> tuple[Selection, _First]:
@@ -492,7 +563,7 @@ def _selected(reading: _Reading, recording: Recording) -> tuple[Selection, _Firs
                 recipe = dataclasses.replace(recipe, discrete=names or int(discrete))
             converter = Converter(selection, recipe, int(start) if discrete else 0)
             spool = Spool(converter.width)
-            reading.first = _First(selection, converter, spool, source, choices)
+            reading.first = _First(layout, selection, converter, spool, source, choices)
         reading.selections[layout] = _in_order(selection, reading.first, source)
     first = cast("_First", reading.first)
     if choices != first.choices:
@@ -582,14 +653,20 @@ def _cut(
             parts = _parts_of(reading, recorded, roles, kind, inside, is_piece=is_piece)
             # A short last window is kept where it is labelled, and where all are to be judged.
             takes_short = reading.every or not (NOMINAL_ROLES & {*parts} or (parts and not inside))
+            source = recorded.label
             if stop - start < length and not takes_short:
-                reading.tally.leave_out(
-                    "row(s) at ends of recordings, less than a window", stop - start
+                reading.ledger.add(
+                    "row",
+                    "dropped",
+                    "at ends of recordings, less than a window",
+                    count=stop - start,
+                    source=source,
                 )
             elif stop - start < reading.shortest:
                 if not (is_piece or reading.every):
                     raise _too_short(reading, recorded.recording, stop - start)
-                reading.tally.leave_out(f"piece(s) shorter than {reading.shortest} rows")
+                reason = f"pieces shorter than {reading.shortest} rows"
+                reading.ledger.add("episode", "dropped", reason, source=source)
             else:
                 if has_windows and not inside:
                     reading.cut_by_outcome |= {*parts} - NOMINAL_ROLES
@@ -618,7 +695,11 @@ def _parts_of(
     is_piece: bool,
 ) -> list[str]:
     """Return the parts that an episode of a recording belongs to."""
-    source, recipe, tally = recorded.source, reading.recipe, reading.tally
+    source, recipe = recorded.source, reading.recipe
+
+    def leave_out(item: Item, reason: str) -> None:
+        reading.ledger.add(item, "dropped", reason, source=recorded.label)
+
     if kind:
         return [f"test/{kind}"]
     nominal = sorted(roles & NOMINAL_ROLES)
@@ -631,7 +712,8 @@ def _parts_of(
         is_said = any(_says_rows(reading, name) for name in kinds)
         return [f"test/{name}" for name in sorted(kinds) if not is_said][:1] or [EVERY]
     if recipe.kinds or recipe.outcome:
-        tally.leave_out("nominal recording(s) in files of an anomaly alone", not nominal)
+        if not nominal:
+            leave_out("recording", "nominal, in files of an anomaly alone")
         return nominal
     # Intervals may name an anomaly that has no files of its own.
     kinds |= {n for n in labelled if n and not recipe.anomalous.get(n, _NO_FILES).files}
@@ -641,7 +723,7 @@ def _parts_of(
         if recipe.paired or not any(_says_rows(reading, name) for name in kinds):
             return [f"test/{name}" for name in sorted(kinds)]
         if is_piece:
-            tally.leave_out("window(s) of anomalous recordings without an anomalous row")
+            leave_out("episode", "windows of anomalous recordings without an anomalous row")
             return []
         # Raised at the end, as the names in a list of intervals may be wrong.
         reading.problems.append(
@@ -658,7 +740,8 @@ def _parts_of(
             "windows without anomalous rows are nominal; labels of nominal rows other than 0, "
             "false, H or nothing are named by nominal_label"
         )
-    tally.leave_out("window(s) with anomalous rows, of nominal files", not matching)
+    if not matching:
+        leave_out("episode", "windows with anomalous rows, of nominal files")
     return matching
 
 
@@ -683,7 +766,7 @@ def _too_short(reading: _Reading, recording: Recording, rows: int) -> Trajectory
     )
 
 
-def _keep(reading: _Reading, facts: EpisodeFacts) -> None:
+def _keep(reading: _Reading, facts: EpisodeFacts, label: str) -> None:
     baseline = 0 if reading.every else reading.recipe.baseline
     if early := [start for start, _ in facts.intervals if 0 <= start < baseline]:
         if "#" not in facts.name:
@@ -691,7 +774,8 @@ def _keep(reading: _Reading, facts: EpisodeFacts) -> None:
                 f"{facts.source} is anomalous from row {early[0]} on, expected its first "
                 f"{baseline} rows (baseline) to be nominal"
             )
-        reading.tally.leave_out("window(s) that are anomalous within their baseline")
+        reason = "windows that are anomalous within their baseline"
+        reading.ledger.add("episode", "dropped", reason, source=label)
         return
     episodes = reading.parts.setdefault(EVERY if reading.every else facts.part, [])
     if len(episodes) == EPISODES and not reading.every:
@@ -706,7 +790,6 @@ def _in_parts(reading: _Reading) -> EpisodeSource:
         source = _source(reading, reading.parts)
         if reading.by_stamps:
             source.parts[EVERY].sort(key=lambda facts: facts.begin)
-        source.notes += reading.tally.lines()
         return source
     if reading.first is None:
         raise UsageError("there are no recordings to read, expected at least one")
@@ -720,8 +803,8 @@ def _in_parts(reading: _Reading) -> EpisodeSource:
     parts = _shared_out(reading)
     for part in (part for part in (TRAIN, CALIBRATION) if not parts[part]):
         why = f"[nominal] names no file with one for {part}"
-        if left_out := [counted(n, noun) for noun, n in reading.tally.left_out.items() if n]:
-            why = f"left out are {', '.join(left_out)}"
+        if left_out := [f"{counted(e.count, f'{e.item}(s)')}, {e.reason}" for e in reading.ledger]:
+            why = f"left out are {'; '.join(left_out)}"
         if count := len(reading.parts.get(FILES, ())):
             why = f"the nominal files make {count}; a window cuts long recordings into several"
         raise UsageError(f"there are no {part} episodes, expected at least 1: {why}")
@@ -737,7 +820,6 @@ def _in_parts(reading: _Reading) -> EpisodeSource:
     source = _source(reading, parts)
     groups = {kind: recipe.anomalous.get(kind, _NO_FILES).group for kind in kinds}
     source.groups = groups | {kind: ANOMALIES[kind].group for kind in kinds if kind in ANOMALIES}
-    source.unused = tuple(dict.fromkeys(name for s in selections.values() for name in s.unused))
     _settle_columns(source, recipe)
     source.notes[:0] = _notes(reading, source)
     if lacking:
@@ -747,10 +829,13 @@ def _in_parts(reading: _Reading) -> EpisodeSource:
 
 def _source(reading: _Reading, parts: dict[str, list[EpisodeFacts]]) -> EpisodeSource:
     if reading.first is None or not parts:
+        for failure in reading.failures:
+            raise failure
         raise UsageError("there are no episodes to read, expected at least one")
     converter, rate = reading.first.converter, reading.recipe.rate
     if rate is None and reading.steps:
-        rate = even_rate(reading.steps)
+        rate = even_rate([s for of_topic in reading.steps.values() for s in of_topic.values()])
+    _say_of_all(reading)
     return EpisodeSource(
         converter.sensors,
         converter.actions,
@@ -760,7 +845,26 @@ def _source(reading: _Reading, parts: dict[str, list[EpisodeFacts]]) -> EpisodeS
         tuple(range(converter.width)),
         rate,
         parts,
+        ledger=reading.ledger,
+        recordings=reading.recordings,
     )
+
+
+def _say_of_all(reading: _Reading) -> None:
+    """Add what is known when all recordings are read: unused columns, and clocks of other units."""
+    unused: dict[str, list[str]] = {}
+    for layout, labels in reading.labels.items():
+        for name in reading.selections[layout].unused:
+            unused.setdefault(name, []).extend(labels)
+    for name, labels in unused.items():
+        for label in labels:
+            reading.ledger.add("column", "dropped", "no line names it", name=name, source=label)
+    for steps in reading.steps.values():
+        median = float(np.median([s.usual for s in steps.values()]))
+        for label, step in ((label, s.usual) for label, s in steps.items()):
+            if not median / _SLOWER < step < median * _SLOWER:
+                reason = f"a row every {step:g} s, where others have one every {median:g} s"
+                reading.ledger.add("recording", "kept", reason, source=label)
 
 
 def _shared_out(reading: _Reading) -> dict[str, list[EpisodeFacts]]:
@@ -812,23 +916,17 @@ def _notes(reading: _Reading, source: EpisodeSource) -> list[str]:
             how = f"shuffled (seed {recipe.seed})"
         lines.append(f"nominal episodes were shared out {how}")
     if reading.steps and source.rate is None:
-        shortest = min(steps.shortest for steps in reading.steps)
-        longest = max(steps.longest for steps in reading.steps)
+        steps = [s for of_topic in reading.steps.values() for s in of_topic.values()]
+        shortest, longest = min(s.shortest for s in steps), max(s.longest for s in steps)
         lines.append(
             f"rows are {shortest:g} to {longest:g} s apart and taken as they are: rate in the "
             "recipe resamples them"
         )
-    lines += reading.tally.lines()
     if reading.first and (choices := reading.first.converter.choices):
         lines.append(
             f"actions are whole numbers from 0 to {choices - 1}: if they are choices, "
             f"discrete = {choices} (--discrete {choices}) makes each a column"
         )
-    if source.unused:
-        further = len(source.unused) - _LISTED
-        more = f" and {further} more, which data inspect lists" if further > 0 else ""
-        names = ", ".join(source.unused[:_LISTED])
-        lines.append(f"columns that no line names: {names}{more}")
     return lines
 
 

@@ -423,7 +423,7 @@ class _Target:
             versions = {"oodd-eval": __version__, "numpy": np.__version__}
             definition = {"name": recipe.split, "source": IMPORTED}
             layout.write_manifest(self.directory, definition, ordered, 0, versions)
-        for line in source.notes:
+        for line in (*source.notes, *source.summary):
             report(line)
         return Split(self.directory)
 

@@ -5,7 +5,7 @@ something out, holds it or changes it adds a line; what is kept as it is needs n
 """
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal, Self
 
@@ -15,6 +15,7 @@ Item = Literal["file", "recording", "episode", "column", "row", "cell", "mark"]
 Fate = Literal["kept", "held", "dropped", "changed"]
 
 _NAMED: Final = 6  # sources that a line of JSON lists
+_LINES: Final = 12  # that a summary prints, and names in one of them
 _CELL: Final = 60  # characters of a cell that are quoted
 
 
@@ -59,6 +60,14 @@ class LedgerEntry:
         parts += [f'"{self.cell}"'] if self.cell else []
         return " ".join(filter(None, parts))
 
+    def where(self, total: int = 0) -> str:
+        """Return how many sources it is in, and the first place; `total` is that of all sources."""
+        of_all = f" of {total}" if total else ""
+        many = f" in {len(self.sources)}{of_all}: first" if len(self.sources) > 1 else ":"
+        if len(self.sources) == total > 1:
+            return f" in all {total}"
+        return f"{many} {self.first}" if self.first else ""
+
     def line(self, total: int = 0) -> str:
         """Return the entry as a line of text.
 
@@ -71,10 +80,7 @@ class LedgerEntry:
         items = counted(self.count, f"{self.item}(s)")
         if self.item in {"column", "file", "recording"} and self.name:
             items, what = f"{self.item} {self.name}", ""
-        of_all = f" of {total}" if total else ""
-        many = f" in {len(self.sources)}{of_all}: first" if len(self.sources) > 1 else ":"
-        where = f"{many} {self.first}" if self.first else ""
-        return f"{self.fate}: {items}{what}, {self.reason}{where}"
+        return f"{self.fate}: {items}{what}, {self.reason}{self.where(total)}"
 
     def as_json(self) -> dict[str, Any]:
         """Return the entry as values for JSON."""
@@ -172,6 +178,32 @@ class Ledger:
         """
         return [entry.line(total) for entry in self]
 
+    def complete(self, other: Self) -> None:
+        """Add those entries of another ledger of which this one says nothing of the same thing."""
+        things = {_thing(entry) for entry in self}
+        self._entries |= {k: e for k, e in other._entries.items() if _thing(e) not in things}
+
+    def summary(self, sensors: Sequence[str], total: int = 0) -> list[str]:
+        """Return the sensors with the columns that were left out, and the other entries, in lines.
+
+        What concerns few recordings comes first; of very many entries some are left out.
+
+        Parameters
+        ----------
+        sensors
+            Names of the sensors.
+        total
+            Number of recordings in all; 0 where that is not known.
+        """
+        left_out = sorted(self.of("column", "dropped"), key=lambda entry: len(entry.sources))
+        columns = [f"{e.name} ({e.reason}{e.where(total)})" for e in left_out]
+        line = f"sensors: {_some(sensors)}"
+        line += f"; left out: {_some(columns)}" if columns else ""
+        others = [entry for entry in self if entry not in left_out]
+        lines = [e.line(total) for e in sorted(others, key=lambda entry: len(entry.sources))]
+        more = len(lines) - _LINES
+        return [line, *lines[:_LINES], *([f"{more} more, which --json has"] if more > 0 else [])]
+
     def as_json(self) -> list[dict[str, Any]]:
         """Return the entries as values for JSON."""
         return [entry.as_json() for entry in self]
@@ -183,3 +215,12 @@ class Ledger:
         for other in ledgers:
             ledger.merge(other)
         return ledger
+
+
+def _thing(entry: LedgerEntry) -> tuple[str, ...]:
+    return (entry.item, entry.name, "" if entry.item == "column" else entry.reason)
+
+
+def _some(texts: Sequence[str]) -> str:
+    more = len(texts) - _LINES
+    return ", ".join(texts[:_LINES]) + (f" and {more} more" if more > 0 else "")

@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from oodd_eval.data.parts import CALIBRATION, TRAIN, TWINS
 from oodd_eval.errors import TrajectoryError, UnknownNameError, UsageError
+from oodd_logs.ledger import Fate, Ledger
 from oodd_logs.marks import IntervalList, Mark, anomalous_cells, runs_of
-from oodd_logs.readers.cells import first_text
+from oodd_logs.readers.cells import mixed
 from oodd_logs.recipe import Recipe, anomaly_name
 from oodd_logs.recording import Recording, parse_times
-from oodd_logs.rows import Tally, TopicRows, read_column
+from oodd_logs.rows import TopicRows, read_column
 from oodd_logs.selecting import Selection, find_columns, layout_of, named_columns
 from oodd_logs.stamps import (
     Stretch,
@@ -58,6 +59,11 @@ class Recorded:
     def source(self) -> str:
         """Its name in messages."""
         return self.recording.source
+
+    @property
+    def label(self) -> str:
+        """Its name in the ledger: its source, with the file as it is named below the folder."""
+        return self.source.replace(str(self.path), self.relative, 1)
 
     @property
     def kinds(self) -> list[str]:
@@ -131,8 +137,8 @@ class StampedRows:
         Its chosen columns.
     recipe
         Says at which rate and where to cut, and what is anomalous.
-    tally
-        Counts rows that are dropped.
+    ledger
+        Takes rows that are dropped, and marks of none.
 
     Attributes
     ----------
@@ -146,12 +152,12 @@ class StampedRows:
     """
 
     def __init__(
-        self, recorded: Recorded, selection: Selection, recipe: Recipe, tally: Tally
+        self, recorded: Recorded, selection: Selection, recipe: Recipe, ledger: Ledger
     ) -> None:
         self._recorded, self._selection = recorded, selection
-        self._recipe, self._tally = recipe, tally
+        self._recipe, self._ledger = recipe, ledger
         self.topics = {
-            name: TopicRows(recorded.recording, name, selection, recipe, tally)
+            name: TopicRows(recorded.recording, name, selection, recipe, ledger, recorded.label)
             for name in selection.topics
         }
         is_timed = bool(recipe.time) or recipe.rate is not None
@@ -163,19 +169,35 @@ class StampedRows:
     def _read(self, topic: str) -> Times:
         """Return the stamps of a topic in seconds, NaN where a row has none."""
         source, column = self._recorded.source, self._selection.times[topic]
-        blocks = [
-            _seconds(cells, column.quantity.unit, f"{source}, column {column.column!r}")
-            for _start, cells in read_column(self._recorded.recording.topics[topic], column.column)
-        ]
-        times = np.concatenate([np.empty(0), *blocks])
-        missing = ~np.isfinite(times)
-        if missing.any() and self._recipe.missing == "refuse":
+        is_strict = self._recipe.missing == "refuse"
+        parsed: list[Times] = [np.empty(0)]
+        for start, cells in read_column(self._recorded.recording.topics[topic], column.column):
+            what = f"{source}, column {column.column!r}"
+            try:
+                times = _seconds(cells, column.quantity.unit, what)
+            except TrajectoryError:
+                times = np.empty(0) if is_strict else _tolerant(cells, column.quantity.unit, what)
+                if is_strict or 2 * np.isnan(times).sum() >= len(times):
+                    raise
+            rows = np.flatnonzero(np.isnan(times))
+            cell = str(cells[rows[0]]) if len(rows) and cells.dtype.kind == "U" else ""
+            self._dropped("without a stamp", start + rows, cell, column.column)
+            parsed.append(times)
+        stamps = np.concatenate(parsed)
+        missing = ~np.isfinite(stamps)
+        if missing.any() and is_strict:
             raise TrajectoryError(
                 f"{source}, row {int(missing.argmax())} has no stamp: missing = 'drop' in the "
                 "recipe leaves such rows out"
             )
-        self._tally.add("rows without a stamp dropped", int(missing.sum()), source)
-        return times
+        return stamps
+
+    def _dropped(self, reason: str, rows: NDArray[Any], cell: str = "", name: str = "") -> None:
+        if len(rows):
+            row, count, source = int(rows[0]), len(rows), self._recorded.label
+            self._ledger.add(
+                "row", "dropped", reason, name=name, count=count, source=source, row=row, cell=cell
+            )
 
     def stretches(self) -> tuple[list[Stretch], list[Times]]:
         """Return the rows that become episodes, on an even grid or as they are, and their stamps.
@@ -207,19 +229,25 @@ class StampedRows:
         for name, numbers in usable.items():
             rows = numbers[np.isfinite(self._stamps[name][numbers])]
             times = self._stamps[name][rows]
+            is_kept = np.ones(len(rows), bool)
             if recipe.missing == "keep":  # whatever is recorded is judged
-                rising = times > np.append(-np.inf, np.maximum.accumulate(times)[:-1])
-                self._tally.add("rows stamped before others dropped", int((~rising).sum()), source)
-                rows, times = rows[rising], times[rising]
+                is_kept = times > np.append(-np.inf, np.maximum.accumulate(times)[:-1])
+                self._dropped("stamped before a row above it, or as it", rows[~is_kept])
+            elif recipe.rate is not None:  # the later of two rows with one stamp holds
+                is_kept = times != np.append(times[1:], np.inf)
+                self._dropped("stamped as the row below it", rows[~is_kept])
+            rows, times = rows[is_kept], times[is_kept]
             if not len(rows):
                 of_topic = f" of topic {name!r}" if name else ""
                 raise TrajectoryError(f"{source} has no rows{of_topic}, expected some")
             check_stamps(times, rows, source, resampled=recipe.rate is not None)
             usable[name], timed[name] = rows, times
-        stretches, left_out = [], sum(map(len, timed.values()))
+        stretches = []
+        used = {name: np.zeros(len(times), bool) for name, times in timed.items()}
         for first, last in cut_at_gaps(timed, recipe.gap, recipe.rate, source):
             inside = {n: (times >= first) & (times <= last) for n, times in timed.items()}
-            left_out -= sum(int(rows.sum()) for rows in inside.values())
+            for name, rows_inside in inside.items():
+                used[name] |= rows_inside
             if recipe.rate is None:
                 ((name, mask),) = inside.items()
                 rows = usable[name][mask]
@@ -228,7 +256,8 @@ class StampedRows:
                 stretch = on_grid(timed, first, last, recipe.rate, source)
                 sources = {n: usable[n][numbers] for n, numbers in stretch.sources.items()}
                 stretches.append(dataclasses.replace(stretch, sources=sources))
-        self._tally.add("rows left out where another topic has none", left_out, source)
+        for name, mask in used.items():
+            self._dropped("where another topic has none", usable[name][~mask], name=name)
         return stretches, [*timed.values()]
 
     def marks(self, intervals: IntervalList, *, is_anomalous: bool) -> list[Mark]:
@@ -246,20 +275,25 @@ class StampedRows:
         for text, column in self._selection.labels.items():
             owners = [name for name, table in recipe.anomalous.items() if text in table.labels]
             blocks = [np.zeros(0, np.bool_)]
-            for _start, cells in read_column(
-                recorded.recording.topics[column.topic], column.column
-            ):
+            for start, cells in read_column(recorded.recording.topics[column.topic], column.column):
+                labels = self._labels(cells, start, column.column)
                 before = bool(blocks[-1][-1:].any())
-                blocks.append(anomalous_cells(cells, recipe, before=before))
+                blocks.append(anomalous_cells(labels, recipe, before=before))
             marks += [
                 self._mark(start, stop, kind, column.topic)
                 for start, stop in runs_of(np.concatenate(blocks))
                 for kind in ([""] if text in recipe.labels else owners)
             ]
-        for _, start, stop, kind in intervals.of_recording(
+        for _, first, stop, kind in intervals.of_recording(
             recorded.path, recorded.recording.name, recorded.relative
         ):
-            marks.append(self._mark(start, stop, kind and anomaly_name(kind)))
+            try:
+                marks.append(self._listed(first, stop, kind and anomaly_name(kind)))
+            except (TrajectoryError, UsageError) as error:
+                if recipe.missing != "keep":  # a scan goes on
+                    raise
+                reason = str(error).removeprefix(f"{recorded.source}: ")
+                self._ledger.add("mark", "dropped", reason, name=kind, source=recorded.label)
         tables = {name: recipe.anomalous[name] for name in recorded.kinds}
         onsets = [(table.onset, table.stop, name) for name, table in tables.items()]
         onset = recorded.recording.fields.get("onset")
@@ -269,6 +303,42 @@ class StampedRows:
             if first is not None:
                 marks.append(self._mark(int(first), stop, kind))
         return marks
+
+    def _labels(self, cells: NDArray[Any], start: int, name: str) -> NDArray[Any]:
+        """Return labels, as numbers where they are; say which are missing, or other texts."""
+        numbers, is_text = mixed(cells) if cells.dtype.kind == "U" else (cells, np.isnan(cells) < 0)
+        present = np.isfinite(numbers)
+        absent = ~present & ~is_text
+        if not present.any():
+            return cells
+        cases: tuple[tuple[NDArray[np.bool_], Fate, str], ...] = (
+            (absent, "held", "no label"),
+            (is_text, "kept", "a label that is text among numbers"),
+        )
+        for which, fate, reason in cases:
+            if which.any() and 2 * which.sum() < len(cells):
+                row, source = int(which.argmax()), self._recorded.label
+                cell, count = str(cells[row]) * bool(is_text[row]), int(which.sum())
+                place = {"source": source, "cell": cell}
+                self._ledger.add(
+                    "cell", fate, reason, name=name, count=count, row=start + row, **place
+                )
+        return cells if is_text.any() else numbers
+
+    def _listed(self, start: Any, stop: Any, kind: str) -> Mark:
+        """Return the mark of an interval; `TrajectoryError` where the recording has none of it."""
+        mark, topic = self._mark(start, stop, kind), self._selection.topics[0]
+        if topic in self._stamps:
+            times = self._stamps[topic]
+            if mark.stop <= np.nanmin(times) or mark.start > np.nanmax(times):
+                column = self._selection.times[topic].column
+                cells = self._recorded.recording.topics[topic].read([column], 0, len(times))[column]
+                first, last = (str(cells[np.isfinite(times)][i]) for i in (0, -1))
+                raise TrajectoryError(
+                    f"{self._recorded.source}: an anomaly is from {start} to {stop}, expected a "
+                    f"part of the recording, whose first stamp is {first} and its last {last}"
+                )
+        return mark
 
     def _mark(self, start: Any, stop: Any, kind: str, topic: str = "") -> Mark:
         topic = topic or self._selection.topics[0]
@@ -310,10 +380,26 @@ class StampedRows:
         return float(stamps[row] + time - logged[row])
 
 
+def _tolerant(cells: NDArray[Any], unit: str, source: str) -> Times:
+    """Return stamps, NaN for the cells that are none."""
+    try:
+        return _seconds(cells, unit, source)
+    except TrajectoryError:
+        if len(cells) == 1:
+            return np.array([np.nan])
+    middle = len(cells) // 2
+    return np.append(*(_tolerant(x, unit, source) for x in (cells[:middle], cells[middle:])))
+
+
 def _seconds(cells: NDArray[Any], unit: str, source: str) -> Times:
-    row = first_text(cells.tolist()) if cells.dtype.kind == "U" else 0
-    if row and cells[0]:  # stamps that begin as numbers
-        raise TrajectoryError(f"{source}: row {row}: {str(cells[row])!r:.60}, expected a number")
+    if cells.dtype.kind == "U":
+        stamps, is_text = mixed(cells)
+        if np.isfinite(stamps).sum() > is_text.sum():  # numbers, and few texts
+            if is_text.any():
+                row = int(is_text.argmax())
+                text = f"{str(cells[row])!r:.60}"
+                raise TrajectoryError(f"{source}: row {row}: {text}, expected a number")
+            cells = stamps
     try:
         return parse_times(cells, "" if cells.dtype.kind == "U" else unit_of(unit))
     except (TrajectoryError, UsageError) as error:

@@ -4,11 +4,10 @@ Nothing here holds more than a block of a recording; what comes out is float64.
 """
 
 import contextlib
-import math
 import tempfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any, Final, cast
 
 import numpy as np
@@ -16,10 +15,10 @@ from numpy.typing import NDArray
 
 from oodd_eval.data.facts import Quantity, Role
 from oodd_eval.errors import OutputError, TrajectoryError, UsageError
-from oodd_eval.names import counted
-from oodd_logs.readers.cells import first_text, numbers
+from oodd_logs.ledger import Fate, Item, Ledger
+from oodd_logs.readers.cells import mixed
 from oodd_logs.recipe import Recipe
-from oodd_logs.recording import Recording, Topic
+from oodd_logs.recording import Column, Recording, Topic
 from oodd_logs.selecting import ChosenColumn, Selection, matches_any
 from oodd_logs.stamps import Stretch
 
@@ -29,35 +28,6 @@ _MOST_ACTIONS: Final = 1000  # of discrete ones, each a column
 _FULL_TURN: Final = {"deg": 180.0, "°": 180.0, "degree": 180.0, "degrees": 180.0}
 
 Matrix = NDArray[np.float64]
-
-
-@dataclass(slots=True)
-class Tally:
-    """Counts of rows dropped and held, and of what was left out, for the message at the end."""
-
-    rows: Counter[str] = field(default_factory=Counter)
-    left_out: Counter[str] = field(default_factory=Counter)
-    files: dict[str, set[str]] = field(default_factory=dict)
-
-    def add(self, what: str, rows: int, source: str) -> None:
-        """Count rows of a recording."""
-        if rows:
-            self.rows[what] += rows
-            self.files.setdefault(what, set()).add(source)
-
-    def leave_out(self, what: str, number: int = 1) -> None:
-        """Count what was left out."""
-        self.left_out[what] += number
-
-    def lines(self) -> list[str]:
-        """Return a line for each thing that was counted."""
-        return [
-            *(
-                f"{what}: {n} in {counted(len(self.files[what]), 'recording(s)')}"
-                for what, n in self.rows.items()
-            ),
-            *(f"left out: {counted(n, what)}" for what, n in self.left_out.items() if n),
-        ]
 
 
 def read_column(topic: Topic, column: str) -> Iterator[tuple[int, NDArray[Any]]]:
@@ -78,15 +48,23 @@ class TopicRows:
     selection
         Chosen columns of the recording.
     recipe
-        Says what missing values do.
-    tally
-        Counts what is held and dropped.
+        Says what missing values do; text among numbers is missing.
+    ledger
+        Takes what is held and dropped.
+    label
+        Name of the recording in the ledger.
     """
 
     def __init__(
-        self, recording: Recording, name: str, selection: Selection, recipe: Recipe, tally: Tally
+        self,
+        recording: Recording,
+        name: str,
+        selection: Selection,
+        recipe: Recipe,
+        ledger: Ledger,
+        label: str,
     ) -> None:
-        self._topic, self._source = recording.topics[name], recording.source
+        self._topic, self._source, self._label = recording.topics[name], recording.source, label
         self._count = self._topic.rows
         rewards = (selection.reward,) if selection.reward else ()
         columns = (*selection.sensors, *selection.actions, *rewards)
@@ -95,11 +73,13 @@ class TopicRows:
         self._unique = list(dict.fromkeys(self._columns))
         # What a last action led to was not recorded: it may be missing.
         self._may_end = np.array([i >= len(selection.sensors) for i in self.indices], bool)
-        self._policy, self._most, self._tally = recipe.missing, recipe.missing_rows, tally
+        self._policy, self._most, self._ledger = recipe.missing, recipe.missing_rows, ledger
         self._position = 0
         self._last = np.full(len(self._columns), np.nan)
         self._runs = np.zeros(len(self._columns), np.int64)
         self._step = max(64, _CELLS // max(1, len(self._columns)))
+        self._words: dict[str, Column] = {}  # texts among the numbers that were read last
+        self._shares: dict[str, str] = {}
 
     def usable(self) -> NDArray[np.int64]:
         """Return the numbers of the rows that missing values leave.
@@ -111,6 +91,8 @@ class TopicRows:
         """
         if self._policy == "refuse":
             return np.arange(self._count)
+        if self._policy == "keep":  # for the scan to say, but for what the logger's end leaves
+            return np.arange(self._count - self._ending())
         firsts = np.full(len(self._columns), -1)
         complete = np.zeros(self._count, bool)
         for start in range(0, self._count, self._step):
@@ -119,27 +101,38 @@ class TopicRows:
             firsts[now] = start + present.argmax(axis=0)[now]
             present[-1:] |= self._may_end & (start + len(present) == self._count)
             complete[start : start + len(present)] = present.all(axis=1)
-            if self._policy != "drop" and firsts.min(initial=0) >= 0:
+            if self._policy == "hold" and firsts.min(initial=0) >= 0:
                 break
         lacking = [name for name, row in zip(self._columns, firsts, strict=True) if row < 0]
-        if self._policy == "keep" and lacking:  # for the scan to say
-            return np.arange(self._count)
         kept = np.flatnonzero(complete)
         if lacking or (self._policy == "drop" and not len(kept)):
             problem = f"column {lacking[0]!r} has no value" if lacking else "no row has all values"
             raise TrajectoryError(
                 f"{self._source}: {problem}, expected some: leave the column or the file out"
             )
-        if self._policy != "drop":
+        if self._policy == "hold":
             first = self._position = int(firsts.max(initial=0))
-            self._tally.add("leading rows with missing values dropped", first, self._source)
+            late = self._columns[int(firsts.argmax())] if first else ""
+            self._say("row", "dropped", "before the first value", late, first, 0)
             return np.arange(first, self._count)
         dropped = np.diff(kept) - 1
         if dropped.max(initial=0) > self._most:
             row = int(kept[int(dropped.argmax())]) + 1
             raise self._too_long(row, "", int(dropped.max()))
-        self._tally.add("rows with missing values dropped", self._count - len(kept), self._source)
+        count, row = self._count - len(kept), int(complete.argmin())
+        self._say("row", "dropped", "missing values", "", count, row)
         return kept
+
+    def _ending(self) -> int:
+        """Return how many last rows lack values of some columns, as where a logger was ended."""
+        most = min(self._most, self._count // 10)
+        lacks = ~np.isfinite(self._cells(self._count - most, self._count))[::-1]
+        ends = np.where(lacks.all(axis=0), 0, lacks.argmin(axis=0))
+        ends[self._may_end & (ends == 1)] = 0
+        count = int(ends.max(initial=0))
+        names = ", ".join(n for n, end in zip(self._columns, ends, strict=True) if end)
+        self._say("row", "dropped", "last ones without a value", names, count, self._count - count)
+        return count
 
     def rows(self, numbers: NDArray[np.int64]) -> Matrix:
         """Return rows by their numbers, which never fall, from one call to the next either.
@@ -163,7 +156,7 @@ class TopicRows:
                 before = cells[-2] if len(cells) > 1 else self._last
                 ends = self._may_end & ~np.isfinite(cells[-1])
                 cells[-1, ends] = np.nan_to_num(before[ends])
-            if self._policy in {"refuse", "hold"}:
+            if self._policy != "drop":
                 self._fill(cells, start)
             upto = int(np.searchsorted(numbers, stop))
             out[done:upto] = cells[numbers[done:upto] - start]
@@ -178,25 +171,41 @@ class TopicRows:
             self._runs[:] = 0
             return
         for j in np.flatnonzero(missing.any(axis=0)).tolist():
-            bad, numbers = missing[:, j], np.arange(len(cells))
-            if self._policy == "refuse":
-                row = int(bad.argmax())
-                value = "missing" if math.isnan(cells[row, j]) else str(cells[row, j])
-                raise TrajectoryError(
-                    f"{self._source}, row {start + row}, column {self._columns[j]!r} is {value}, "
-                    "expected a finite number: missing = 'hold' or 'drop' in a recipe says what "
-                    "to do"
-                )
+            bad, numbers, name = missing[:, j], np.arange(len(cells)), self._columns[j]
+            words = self._words.get(name, np.zeros(len(cells), "U1"))
+            is_text, is_inf = words != "", np.isinf(cells[:, j])
+            for reason, which in (
+                ("text among numbers", is_text),
+                ("infinite", is_inf),
+                ("missing", bad & ~is_text & ~is_inf),
+            ):
+                row = int(which.argmax())
+                cell = str(words[row]) or str(cells[row, j]) * bool(is_inf[row])
+                if self._policy == "refuse" and which.any():
+                    raise TrajectoryError(
+                        f"{self._source}, row {start + row}, column {name!r} is "
+                        f"{f'{cell!r:.60}' if is_text[row] else cell or reason}, expected a "
+                        f"finite number{self._shares.get(name, '')}: missing = 'hold' or 'drop' in a recipe "
+                        "says what to do"
+                    )
+                self._say("cell", "held", reason, name, int(which.sum()), start + row, cell)
+            if self._policy == "keep":
+                continue
             held = np.maximum.accumulate(np.where(bad, -1, numbers))
             runs = np.where(held < 0, numbers + 1 + self._runs[j], numbers - held)
             if runs.max() > self._most:
                 row, longest = start + int(runs.argmax()), int(runs.max())
-                raise self._too_long(row - longest + 1, self._columns[j], longest)
+                raise self._too_long(row - longest + 1, name, longest)
             cells[:, j] = np.where(held < 0, self._last[j], cells[np.maximum(held, 0), j])
             self._runs[j] = runs[-1]
         self._runs[~missing[-1]] = 0
-        count = int(missing.any(axis=1).sum())
-        self._tally.add("rows with missing values held", count, self._source)
+
+    def _say(
+        self, item: Item, fate: Fate, reason: str, name: str, count: int, row: int, cell: str = ""
+    ) -> None:
+        self._ledger.add(
+            item, fate, reason, name=name, count=count, source=self._label, row=row, cell=cell
+        )
 
     def _too_long(self, row: int, column: str, rows: int) -> TrajectoryError:
         problem = f"column {column!r} is missing" if column else "values are missing"
@@ -208,16 +217,30 @@ class TopicRows:
 
     def _cells(self, start: int, stop: int) -> Matrix:
         cells = self._topic.read(self._unique, start, stop)
+        self._words = {}
         for name, values in cells.items():
             if values.dtype.kind == "U":
-                row, distinct = first_text(values.tolist()), dict.fromkeys(values.tolist())
-                texts = [repr(text) for text in distinct if numbers([text]) is None][:4]
-                raise TrajectoryError(
-                    f"{self._source}, row {start + row}, column {name!r} is "
-                    f"{str(values[row])!r:.60}, expected a number: it holds texts such as "
-                    f"{', '.join(texts)}; leave it out, or name it under labels"
-                )
+                cells[name], is_text = mixed(values)
+                self._words[name] = np.where(is_text, values, "")
+                if is_text.any() and name not in self._shares:
+                    self._shares[name] = self._share(name, start + int(is_text.argmax()))
         return np.stack([cells[name] for name in self._columns], axis=1).astype(np.float64)
+
+    def _share(self, name: str, row: int) -> str:
+        """Return in how many rows a column has text; `TrajectoryError` where these are most."""
+        texts: Counter[str] = Counter()
+        present = 0
+        for _start, cells in read_column(self._topic, name):
+            is_text = mixed(cells)[1]
+            texts.update(cells[is_text].tolist())
+            present += int((np.strings.str_len(cells) > 0).sum())
+        if 2 * texts.total() >= present:
+            raise TrajectoryError(
+                f"{self._source}, row {row}, column {name!r} is {next(iter(texts))!r:.60}, "
+                "expected a number: it holds texts such as "
+                f"{', '.join(map(repr, [*texts][:4]))}; leave it out, or name it under labels"
+            )
+        return f", as in all but {texts.total()} of its rows"
 
 
 class Converter:

@@ -6,7 +6,9 @@ prefix ``obs:`` or ``action:``, below its topic where a recording has several.
 
 import dataclasses
 import re
-from collections.abc import Iterable, Sequence
+import unicodedata
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -14,7 +16,7 @@ from oodd_eval.data.facts import Quantity
 from oodd_eval.errors import TrajectoryError, UnknownNameError, UsageError
 from oodd_logs.readers.cells import nearest_spelling
 from oodd_logs.recipe import Recipe
-from oodd_logs.recording import Recording
+from oodd_logs.recording import Column, Recording, Topic
 
 _PREFIX: Final = re.compile(r"\s*(obs|action)\s*:\s*(?=\S)", re.IGNORECASE)
 _UNIT: Final = re.compile(r"(.*?[^\[\]\s])\s*\[\s*([^\[\]]*[^\[\]\s])\s*\]")
@@ -95,6 +97,98 @@ def split_unit(text: str) -> tuple[str, str]:
     return text.strip(), ""
 
 
+def plain_name(text: str) -> str:
+    """Return the name of a column without unit, and without what spellings differ in.
+
+    >>> plain_name("Joint\N{NO-BREAK SPACE}1 [rad]"), plain_name("joint1")
+    ('joint1', 'joint1')
+    """
+    letters = unicodedata.normalize("NFKC", split_unit(text)[0]).casefold()
+    return "".join(c for c in letters if not c.isspace() and unicodedata.category(c) != "Cf")
+
+
+def respellings(layout: Layout, recipe: Recipe, first: Layout | None) -> dict[tuple[str, str], str]:
+    """Return names for columns that are spelled otherwise than in a recipe, or the first recording.
+
+    They differ from these in case, Unicode form, blanks, or in that one of the two has no unit.
+
+    Parameters
+    ----------
+    layout
+        Topics of a recording with their columns.
+    recipe
+        Its keys name columns.
+    first
+        Those of the first recording, as they were named there.
+
+    Returns
+    -------
+    dict
+        From topic and column to the name that a recipe finds.
+    """
+    expected = {(topic, name) for topic, names, _ in first or () for name in names}
+    there = {(topic, name) for topic, names, _ in layout for name in names}
+    spellings: dict[tuple[str, str], list[str]] = defaultdict(list)
+    for topic, name in sorted(there - expected):
+        spellings[topic, plain_name(_aliases("", name)[-1])].append(name)
+
+    def spelled(topic: str, text: str) -> str:
+        """Return the one column that is spelled otherwise than a text; empty for none."""
+        columns = spellings[topic, plain_name(text)]
+        units = {_plain(split_unit(name)[1]) for name in (text, *columns)} - {"", "1"}
+        return columns[0] if len(columns) == 1 and len(units) < 2 else ""
+
+    pairs = [(topic, name, spelled(topic, name)) for topic, name in expected - there]
+    names = {(topic, old): name for topic, name, old in pairs if old}
+    texts = (*_texts_of(recipe), *recipe.sensors, *recipe.actions, recipe.reward, recipe.time)
+    plain = [t.rpartition("=")[2].strip() for t in texts if t and not {*t} & {*"*?"}]
+    exact = {text: _exact(layout, text) for text in plain}
+    taken = {column for columns in exact.values() for column in columns}
+    for text in (text for text in plain if not exact[text]):
+        for topic, _, _ in layout:
+            name = text.removeprefix(f"{topic}." if topic else "")
+            (bare, unit), old = split_unit(name), spelled(topic, name)
+            if old and (topic, old) not in taken:
+                new = name if unit else old.replace(split_unit(old)[0], bare)
+                names.setdefault((topic, old), new)
+    return names
+
+
+def _exact(layout: Layout, text: str) -> list[tuple[str, str]]:
+    """Return the columns that a text names as it is written; those of another unit, too."""
+    glob = _glob(split_unit(text)[0])
+    return [
+        (topic, name)
+        for topic, names, _ in layout
+        for name in names
+        if text in (aliases := _aliases(topic, name)) or any(map(glob.fullmatch, aliases))
+    ]
+
+
+def respelled(recording: Recording, names: Mapping[tuple[str, str], str]) -> Recording:
+    """Return a recording with other names of columns, by topic and column."""
+    topics = {}
+    for name, topic in recording.topics.items():
+        new = {column: names.get((name, column), column) for column in topic.names}
+        topics[name] = _renamed(topic, new) if {*new} != {*new.values()} else topic
+    return dataclasses.replace(recording, topics=topics)
+
+
+def _renamed(topic: Topic, names: Mapping[str, str]) -> Topic:
+    old = {new: name for name, new in names.items()}
+
+    def read(columns: Sequence[str], start: int, stop: int) -> dict[str, Column]:
+        cells = topic.read([old[name] for name in columns], start, stop)
+        return {name: cells[old[name]] for name in columns}
+
+    time = names.get(topic.time, topic.time)
+    return Topic(tuple(names.values()), topic.rows, read, time)
+
+
+def _plain(unit: str) -> str:
+    return " ".join(unicodedata.normalize("NFKC", unit).split())
+
+
 def find_columns(layout: Layout, text: str) -> list[ChosenColumn]:
     """Return the columns that a text of a recipe names, none where there are none.
 
@@ -152,9 +246,7 @@ def select_columns(layout: Layout, recipe: Recipe, source: str) -> Selection:
         if double := [name for name in names if names.count(name) > 1]:
             advice = "rename one, 'new = old'"
             raise UsageError(f"{source} has two {kind} named {double[0]!r}: {advice}")
-    tables = [recipe.nominal.where, *(table.where for table in recipe.anomalous.values())]
-    texts = [recipe.outcome, recipe.kinds, recipe.task, *(key for t in tables for key in t)]
-    fields = [column for text in filter(None, texts) for column in find_columns(layout, text)]
+    fields = [column for text in _texts_of(recipe) for column in find_columns(layout, text)]
     labels = {
         text: column for text in recipe.label_columns for column in find_columns(layout, text)[:1]
     }
@@ -169,13 +261,19 @@ def select_columns(layout: Layout, recipe: Recipe, source: str) -> Selection:
     return Selection(tuple(sensors), tuple(actions), reward, times, labels, unused)
 
 
+def _texts_of(recipe: Recipe) -> list[str]:
+    """Return what names columns, or fields, that say something of a recording or its rows."""
+    tables = [recipe.nominal.where, *(table.where for table in recipe.anomalous.values())]
+    keys = recipe.outcome, recipe.kinds, recipe.task, *(key for t in tables for key in t)
+    return [*recipe.label_columns, *filter(None, keys)]
+
+
 def unnamed_columns(layout: Layout, recipe: Recipe) -> tuple[str, ...]:
     """Return the columns that no key of a recipe without sensors names; none with ``obs:`` ones."""
     columns = [(topic, name) for topic, names, _ in layout for name in names]
     if any((match := _PREFIX.match(name)) and match[1].lower() == "obs" for _, name in columns):
         return ()
-    keys = (recipe.reward, recipe.time, recipe.outcome, recipe.kinds, recipe.task)
-    texts = [*recipe.actions, *recipe.label_columns, *filter(None, keys)]
+    texts = [*recipe.actions, *_texts_of(recipe), *filter(None, (recipe.reward, recipe.time))]
     named = {(c.topic, c.column) for text in texts for c in find_columns(layout, text)}
     unnamed = (column for column in columns if column not in named)
     return tuple(f"{topic}.{name}" if topic else name for topic, name in unnamed)

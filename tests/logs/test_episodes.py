@@ -40,6 +40,10 @@ def read(root, **keys):
     return source, parts
 
 
+def said(source):
+    return [*source.notes, *source.summary]
+
+
 def problem(root, **keys):
     with pytest.raises(OoddError) as raised:
         read(root, **keys)
@@ -73,8 +77,8 @@ def test_globs_renames_and_units_choose_columns(tmp_path):
     assert parts["train"][0].observations.tolist() == [[1, 4, 7], [2, 5, 8], [3, 6, 9]]
     # What the last action led to was not recorded.
     assert parts["train"][0].actions.tolist() == [[1], [1]]
-    assert source.unused == ("note",)
-    assert any("note" in line for line in source.notes)
+    assert [e.name for e in source.ledger.of("column", "dropped")] == ["note"]
+    assert any("note" in line for line in said(source))
 
 
 @pytest.mark.parametrize(
@@ -114,12 +118,12 @@ def test_columns_in_another_order_are_the_same_and_missing_ones_are_not(tmp_path
     source, parts = read(tmp_path, sensors=["d", "a"], constant="drop")
     assert [q.name for q in source.sensors] == ["a"]
     assert np.array_equal(parts["train"][0].observations[:, 0], table(10, 0)["a"])
-    assert any("d" in line and "constant" in line for line in source.notes)
+    assert any("d" in line and "constant" in line for line in said(source))
     rows = table(10, 3)
     write(tmp_path / "train1.csv", {"d": rows["b"], "b": rows["b"], "c": rows["a"], "a": rows["a"]})
     source, parts = read(tmp_path, sensors="*")
     assert np.array_equal(parts["train"][1].observations[:, 0], rows["a"])
-    assert source.unused == ("c",)
+    assert [e.name for e in source.ledger.of("column", "dropped")] == ["c"]
     write(tmp_path / "train1.csv", {"b": rows["b"]})
     assert "lacks a[1]" in problem(tmp_path, sensors="*")
 
@@ -227,7 +231,7 @@ def test_a_gap_is_where_any_topic_is_silent(silent):
         behind = episode.time[:, None] - episode.observations
         assert behind.min() > -1e-4
         assert behind.max() < 3.0 + 1e-3
-    assert any("another topic has none" in line for line in source.notes)
+    assert any("another topic has none" in line for line in said(source))
 
 
 def test_a_clock_that_was_set_back_is_cut_and_labels_and_times_follow(tmp_path):
@@ -283,7 +287,7 @@ def test_even_stamps_say_the_rate_and_uneven_ones_are_reported(tmp_path):
     folder(tmp_path, t=[0, 1, 2, 3, 5, 6, 7, 9, 10, 11])
     source, parts = read(tmp_path, time="t")
     assert source.rate is None
-    assert any("1 to 2 s apart" in line for line in source.notes)
+    assert any("1 to 2 s apart" in line for line in said(source))
     assert parts["train"][0].observations.shape == (10, 2)
 
 
@@ -344,8 +348,12 @@ HELD = [[1, 2], [2, 3], [2, 4], [2, 5], [5, 6], [6, 7], [7, 8], [8, 9]]
 @pytest.mark.parametrize(
     ("missing", "rows", "note"),
     [
-        ("hold", HELD, ("leading", "4 in 2")),
-        ("drop", [row for i, row in enumerate(HELD) if i not in (2, 3)], ("dropped", "8 in 2")),
+        ("hold", HELD, ("4 rows", "before the first value", "in 2 of 4")),
+        (
+            "drop",
+            [row for i, row in enumerate(HELD) if i not in (2, 3)],
+            ("8 rows", "missing values", "in 2 of 4"),
+        ),
     ],
 )
 def test_missing_values_are_held_or_their_rows_dropped(tmp_path, missing, rows, note):
@@ -354,7 +362,7 @@ def test_missing_values_are_held_or_their_rows_dropped(tmp_path, missing, rows, 
         assert word in message
     source, parts = read(tmp_path, missing=missing)
     assert parts["train"][0].observations.tolist() == rows
-    assert any(all(word in line for word in note) for line in source.notes)
+    assert any(all(word in line for word in note) for line in said(source))
     message = problem(tmp_path, missing=missing, missing_rows=1)
     for word in ("train0.csv, row 4", "2 rows", "missing_rows"):
         assert word in message
@@ -399,7 +407,7 @@ def test_labels_may_switch_back_and_end_before_the_file(tmp_path, values, keys):
     assert episode.intervals == ((2, 4), (6, 7))
     assert episode.kind == "leak"
     assert source.groups == {"leak": "dynamics"}
-    assert any("2 intervals with 3 anomalous rows" in line for line in source.notes)
+    assert any("2 intervals with 3 anomalous rows" in line for line in said(source))
     with pytest.raises(TrajectoryError, match=r"odd\.csv has no anomalous row"):
         labelled([values[0]] * 10)
 
@@ -454,7 +462,7 @@ def test_a_nominal_file_with_anomalous_rows_is_refused_unless_windows_divide_it(
     # Without a kind for them, such windows are left out.
     source, parts = read(tmp_path, **keys | {"anomalous": None}, window=5)
     assert "test/leak" not in parts
-    assert any("left out: 2 windows with anomalous rows" in line for line in source.notes)
+    assert any("dropped: 2 episodes, windows with anomalous rows" in line for line in said(source))
 
 
 def test_onsets_intervals_and_fields_name_rows(tmp_path):
@@ -568,12 +576,12 @@ def test_parts_follow_one_another_in_natural_order_or_are_shuffled(tmp_path):
     source, (train, calibration, test) = names()
     assert train + calibration + test == [f"run_{i}" for i in range(1, 13)]
     assert (len(train), len(calibration), len(test)) == (6, 3, 3)
-    assert "nominal episodes were shared out in the order of files" in source.notes
+    assert "nominal episodes were shared out in the order of files" in said(source)
     source, mixed = names(order="shuffled", seed=1)
     every = [name for part in mixed for name in part]
     assert every != train + calibration + test
     assert sorted(every) == sorted(train + calibration + test)
-    assert any("shuffled (seed 1)" in line for line in source.notes)
+    assert any("shuffled (seed 1)" in line for line in said(source))
     assert names(order="shuffled", seed=1)[1] == mixed
     # Stamps order recordings where none overlap.
     keys = {"time": "t", "nominal": {"files": "r_*.csv", "parts": [0.34, 0.33, 0.33]}}
@@ -589,7 +597,7 @@ def test_windows_cut_recordings_and_what_is_left_over_is_said(tmp_path):
     source, parts = read(tmp_path, window=10)
     assert [len(e.observations) for e in parts["train"]] == [10] * 4
     assert np.array_equal(parts["train"][1].observations[:, 0], table(25, 0)["a"][10:20])
-    assert any("20 rows at ends" in line for line in source.notes)
+    assert any("20 rows, at ends" in line for line in said(source))
     _, parts = read(tmp_path, window=30)
     assert [len(e.observations) for e in parts["train"]] == [25, 25]
     # The last window of a fault may be shorter.
@@ -642,7 +650,7 @@ def test_a_northing_has_its_training_mean_subtracted(tmp_path):
     assert source.offsets == (pytest.approx(walk[:2].mean(), abs=1e-9), 0.0)
     rows = parts["train"][0].observations
     assert rows[:, 0] == pytest.approx(walk[0] - walk[:2].mean(), abs=1e-8)
-    assert any("training mean" in line for line in source.notes)
+    assert any("training mean" in line for line in said(source))
     source, _ = read(tmp_path, sensors=["a"])
     assert source.offsets == ()
 
@@ -666,12 +674,12 @@ def test_ends_of_recordings_known_by_their_outcome_are_left_out_as_nominal_ones_
     bad = {"bad": {"files": "bad.csv"}}
     source, parts = read(tmp_path, window=10, anomalous=bad)
     assert [len(e.observations) for e in parts["test/bad"]] == [10, 10]
-    assert any("25 rows at ends" in line for line in source.notes)
-    (warning,) = [line for line in source.notes if line.startswith("warning")]
+    assert any("25 rows, at ends" in line for line in said(source))
+    (warning,) = [line for line in said(source) if line.startswith("warning")]
     assert "test/bad was cut by window" in warning
     # What is shorter than a window from the start is whole.
     source, parts = read(tmp_path, window=30, anomalous=bad)
     assert [len(e.observations) for e in parts["test/bad"]] == [25]
-    assert not any("warning" in line for line in source.notes)
+    assert not any("warning" in line for line in said(source))
     source, _ = read(tmp_path, window=10, anomalous={"bad": bad["bad"] | {"onset": 0}})
-    assert not any("warning" in line for line in source.notes)
+    assert not any("warning" in line for line in said(source))

@@ -9,8 +9,9 @@ from typing import Any
 from oodd_eval.data.facts import Quantity
 from oodd_logs.episodes import EVERY, Episode, names_matching, read_every_episode
 from oodd_logs.inspection.draft import draft
-from oodd_logs.inspection.logs import inspect_logs, recognised
+from oodd_logs.inspection.logs import Inspection, inspect_logs, recognised
 from oodd_logs.inspection.meaning import window_of
+from oodd_logs.ledger import Ledger
 from oodd_logs.recipe import Recipe
 from oodd_logs.scanning.outliers import ENOUGH
 
@@ -27,13 +28,16 @@ class RecordedLogs:
         Names, units and roles of the columns.
     baseline
         Rows at the start of every episode that are nominal.
+    ledger
+        What was left out, held or changed.
     notes
-        What was read and left out, a sentence each.
+        Its summary, a line each.
     """
 
     episodes: list[Episode]
     sensors: list[Quantity]
     baseline: int
+    ledger: Ledger
     notes: list[str]
 
 
@@ -70,6 +74,7 @@ def read_logs(
     """
     reader, files, _ = recognised(path, form or (recipe.format if recipe else ""))
     root = path if path.is_dir() and files != [path] else path.parent
+    logs: Inspection | None = None
     if recipe is None:
         logs = inspect_logs(path, reader.name, options or {})
         recipe = Recipe.parse(tomllib.loads(draft(logs)))
@@ -82,6 +87,12 @@ def read_logs(
         listed = any(names_matching(pattern, root) for pattern in recipe.globs)
         root = root if listed else home
     with read_every_episode(recipe, root, files) as source:
+        ledger = logs.ledger if logs else Ledger()
+        ledger.complete(source.ledger)
         return RecordedLogs(
-            list(source.episodes(EVERY)), [*source.sensors], recipe.baseline, list(source.notes)
+            list(source.episodes(EVERY)),
+            [*source.sensors],
+            recipe.baseline,
+            ledger,
+            ledger.summary([q.name for q in source.sensors], source.recordings),
         )
