@@ -2,6 +2,7 @@
 
 import gzip
 import json
+import math
 import struct
 
 import h5py
@@ -18,6 +19,7 @@ from oodd_logs import readers as logs
 from oodd_logs.minari_files import export
 from oodd_logs.readers import Reader, check_reader, library, readers, register_readers
 from oodd_logs.readers.cells import column_names, conventional, nearest_spelling
+from oodd_logs.readers.gathered import Gathered
 from oodd_logs.recording import Recording, Topic, parse_times
 from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.rosbag2 import StoragePlugin
@@ -661,10 +663,61 @@ def check_imu(topic, *, stamps=True):
     assert cells["log_time"] == pytest.approx([10, 10.5, 11])
     assert cells["linear_acceleration.y"] == [0, 2, 4]
     assert cells["bias.2"] == [0, 1, 2]
-    assert cells["extra.0"] == pytest.approx([np.nan, 1, 1], nan_ok=True)
+    assert cells["extra.least"] == pytest.approx([np.nan, 1, 1], nan_ok=True)
+    assert cells["extra.count"] == [0, 1, 2]
     if stamps:
         assert cells["header.stamp"] == [100.5, 101.5, 102.5]
         assert cells["header.frame_id"] == ["base"] * 3
+
+
+@pytest.mark.parametrize(
+    ("message", "columns"),
+    [
+        ({"at": {"nanosec": 500_000_000, "sec": 7}}, {"at": 7.5}),
+        ({"at": {"nanos": 250_000_000, "seconds": "7"}}, {"at": 7.25}),
+        ({"at": {"seconds": 7, "phase": 1}}, {"at.seconds": 7, "at.phase": 1}),
+        ({"name": ["hip", "knee"], "position": [1, 2], "effort": []},
+         {"position.hip": 1, "position.knee": 2}),
+        ({"joint_names": ["hip", "knee"], "points": [{"positions": [1, 2]}, {"positions": [3, 4]}]},
+         {"points.0.positions.hip": 1, "points.0.positions.knee": 2,
+          "points.1.positions.hip": 3, "points.1.positions.knee": 4}),
+        ({"status": [{"name": "arm", "level": 1, "values": [{"key": "temp[C]", "value": "41.5"}]}]},
+         {"status.arm.level": 1, "status.arm.values.temp[C]": 41.5}),
+        ({"tf": [{"child_frame_id": "wrist", "x": 1}]}, {"tf.wrist.x": 1}),
+        ({"pair": [[1, 2], [3, None]]},
+         {"pair.0.0": 1, "pair.0.1": 2, "pair.1.0": 3, "pair.1.1": float("nan")}),
+        ({"ranges": [math.inf, 2.0, *[4.0] * 38]},
+         {"ranges.least": 2, "ranges.mean": 154 / 39, "ranges.count": 39}),
+        ({"a": 1, "image": [7] * 5000, "data": b"png", "text": "x" * 2000}, {"a": 1}),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_values_in_messages_have_names_and_not_places(message, columns):
+    gathered = Gathered("run")
+    gathered.add(message)
+    cells = rows(gathered.topic())
+    assert {name: cell[0] for name, cell in cells.items()} == pytest.approx(columns, nan_ok=True)
+    left_out = {entry.name for entry in gathered.ledger.of("column", "dropped")}
+    assert left_out == {"image", "data", "text"} & {*message}
+    assert {e.name for e in gathered.ledger.of("column", "changed")} == {"ranges"} & {*message}
+
+
+def test_rows_of_changing_parts_are_one_table():
+    gathered, folded = Gathered("run"), Gathered("run", ["beams"])
+    for names in (["hip", "knee"], ["knee", "hip"], ["gripper"]):
+        gathered.add({"name": names, "position": [len(name) for name in names]}, stamp=2.0)
+        gathered.add({"hits": [{"x": 5}] * len(names), "mode": "on" if len(names) > 1 else 1.25})
+        folded.add({"beams": [1] * 50})
+    cells = rows(gathered.topic())
+    nan = np.nan
+    expected = {"position.hip": [3, nan, 3, nan, nan, nan],
+                "position.gripper": [nan] * 4 + [7, nan], "hits.x.count": [nan, 2, nan, 2, nan, 1], "log_time": [2, nan] * 3}  # fmt: skip
+    for name, column in expected.items():
+        assert cells[name] == pytest.approx(column, nan_ok=True)
+    assert cells["mode"] == ["", "on", "", "on", "", "1.25"]
+    assert len(folded.topic().names) == 50
+    with pytest.raises(TrajectoryError, match="has 20006 columns or more"):
+        gathered.add({f"c{i}": i for i in range(20_000)})
 
 
 def write_mcap(path, *, compression=CompressionType.ZSTD):

@@ -9,7 +9,7 @@ import functools
 import importlib
 import pkgutil
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Final
@@ -57,7 +57,8 @@ class Kind:
         Lower-case letters, digits and hyphens.
     words
         Says of columns that are of the kind what they are and what to write: ``{names}`` stands for
-        their names, ``{line}`` for the line of the recipe.
+        their names, ``{line}`` for the line of the recipe. Of values in messages it is the reason
+        for which the ledger has them; nothing is said for empty ones.
     key
         Key of recipes that lists columns of the kind; empty where a recipe says nothing of them.
     recognise
@@ -74,8 +75,8 @@ class Kind:
         kind knows, by their text, NaN for what is missing.
     flatten
         Called with the name of a value in a message, or row of objects, and the value; returns
-        pairs of names and values in its place, which are looked at again, or None for a value of
-        another kind.
+        pairs of names and values in its place, which are looked at again, none for a value that is
+        left out, or None for a value of another kind.
     """
 
     name: str
@@ -103,6 +104,7 @@ def register_kinds(offered: Iterable[Kind]) -> None:
     for kind in offered:
         check_kind(kind)
         _registered[kind.name] = kind
+        _of_messages.cache_clear()
 
 
 def check_kind(kind: Kind) -> None:
@@ -116,11 +118,11 @@ def check_kind(kind: Kind) -> None:
         raise PluginError(f"kind {kind.name!r} has the key {kind.key!r}, but no check and convert")
 
 
-def flattened(name: str, value: Any) -> Iterator[tuple[str, Any]] | None:
-    """Return what a kind makes of a value in a message; None where none knows it."""
-    for kind in kinds().values():
-        if kind.flatten is not None and (pairs := kind.flatten(name, value)) is not None:
-            return iter(pairs)
+def flattened(name: str, value: Any) -> tuple[Kind, list[tuple[str, Any]]] | None:
+    """Return the kind that knows a value in a message, and what it makes of it; None without."""
+    for kind in _of_messages():
+        if (pairs := kind.flatten(name, value)) is not None:  # type: ignore[misc]  those that have it
+            return kind, [*pairs]
     return None
 
 
@@ -139,6 +141,11 @@ def _ours() -> dict[str, Kind]:
         importlib.import_module(m.name) for m in pkgutil.iter_modules(__path__, f"{__name__}.")
     ]
     return {module.KIND.name: module.KIND for module in modules if hasattr(module, "KIND")}
+
+
+@functools.cache
+def _of_messages() -> tuple[Kind, ...]:
+    return tuple(kind for kind in kinds().values() if kind.flatten is not None)
 
 
 _registered: Final[dict[str, Kind]] = {}

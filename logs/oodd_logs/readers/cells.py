@@ -15,6 +15,9 @@ from oodd_eval.names import is_plain
 from oodd_logs.kinds import read_texts
 from oodd_logs.recording import MISSING, Column
 
+WIDEST: Final = 2**14
+"""Columns that a recording may have."""
+
 _TRUTHS: Final = {"true": 1.0, "false": 0.0}
 _PROBED: Final = 500  # cells of which one is a number where a column has some
 _KINDS: Final = {
@@ -146,6 +149,14 @@ def nearest_spelling(name: str) -> str:
     """
     match = re.fullmatch(r"(obs|observations?|actions?)[ _./-]+(.*\S)", name.strip(), re.IGNORECASE)
     return f"{_KINDS[match[1].lower()]}:{match[2]}" if match else ""
+
+
+def check_width(source: object, columns: int) -> None:
+    """Raise `TrajectoryError` for more columns than are looked at."""
+    if columns > WIDEST:
+        raise TrajectoryError(
+            f"{source} has {columns} columns or more, limit {WIDEST}: write fewer, or lists"
+        )
 
 
 def column_names(names: Iterable[str]) -> tuple[str, ...]:

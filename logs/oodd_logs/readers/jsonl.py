@@ -10,8 +10,9 @@ import numpy as np
 
 from oodd_eval.data.bounded import EPISODE
 from oodd_eval.errors import TrajectoryError
+from oodd_logs.ledger import Ledger
 from oodd_logs.readers import Options, Reader, unreadable
-from oodd_logs.readers.gathered import Gathered, flat
+from oodd_logs.readers.gathered import Gathered
 from oodd_logs.readers.matrices import MatrixRows, episode_of
 from oodd_logs.recording import Recording, Topic
 
@@ -24,14 +25,13 @@ def _open(path: Path, _options: Options) -> Iterator[Recording]:
     for i, (line, value) in enumerate(_objects(path)):
         source = f"{path}, line {line}"
         if not rows.rows and (episode := _episode(value, source)):
-            topic, fields = episode
-            yield Recording(f"{name}-{i}", source, {"": topic}, fields)
+            yield Recording(f"{name}-{i}", source, *episode)
         elif i and not rows.rows:
             raise TrajectoryError(f"{source} has no list of steps, as the lines above it have")
         else:
-            rows.add(dict(flat(value)))
+            rows.add(value)
     if rows.rows:
-        yield Recording(name, str(path), {"": rows.topic()})
+        yield Recording(name, str(path), {"": rows.topic()}, ledger=rows.ledger)
 
 
 def _objects(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
@@ -56,8 +56,10 @@ def _objects(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
             yield number, value
 
 
-def _episode(value: Mapping[str, Any], source: str) -> tuple[Topic, dict[str, Any]] | None:
-    """Return the rows and the fields of an object that is an episode; None for a row."""
+def _episode(
+    value: Mapping[str, Any], source: str
+) -> tuple[dict[str, Topic], dict[str, Any], Ledger] | None:
+    """Return the rows, fields and ledger of an object that is an episode; None for a row."""
     # An episode has a list of objects, one a step, or lists of rows of numbers.
     steps = [k for k, v in value.items() if isinstance(v, list) and v and isinstance(v[0], dict)]
     if len(steps) == 1:
@@ -65,12 +67,14 @@ def _episode(value: Mapping[str, Any], source: str) -> tuple[Topic, dict[str, An
         for step in value[steps[0]]:
             if not isinstance(step, dict):
                 raise TrajectoryError(f"{source}: a step is {step!r:.80}, expected an object")
-            rows.add(dict(flat(step)))
-        return rows.topic(), {k: v for k, v in value.items() if k != steps[0]}
+            rows.add(step)
+        fields = {k: v for k, v in value.items() if k != steps[0]}
+        return {"": rows.topic()}, fields, rows.ledger
     if any(isinstance(v, list) and v and isinstance(v[0], list) for v in value.values()):
         arrays = {k: np.asarray(v) for k, v in value.items() if isinstance(v, list)}
         topic, fields = episode_of(cast("Mapping[str, MatrixRows]", arrays), source)
-        return topic, {k: v for k, v in value.items() if not isinstance(v, list)} | fields
+        fields |= {k: v for k, v in value.items() if not isinstance(v, list)}
+        return {"": topic}, fields, Ledger()
     return None
 
 

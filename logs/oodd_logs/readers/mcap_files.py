@@ -10,7 +10,7 @@ from typing import Any, Final
 from oodd_eval.data.bounded import EPISODE
 from oodd_eval.errors import TrajectoryError
 from oodd_logs.readers import TOPICS, Options, Reader, chosen, library
-from oodd_logs.readers.gathered import topics_of
+from oodd_logs.readers.gathered import LISTS, recording_of
 from oodd_logs.recording import Recording
 
 
@@ -46,8 +46,9 @@ def _open(path: Path, options: Options) -> Iterator[Recording]:
             (channel.topic, message.log_time, decoders[channel.id](message.data))
             for _, channel, message in reader.iter_messages(readable)
         )
-        topics = topics_of(path, readable, messages)
-    yield Recording(path.stem, str(path), topics)
+        yield recording_of(path, path.stem, readable, messages, options.get("lists", ()))
 
 
-READER: Final = Reader("mcap", "an MCAP file", (".mcap",), _open, extra="logs", options=TOPICS)
+READER: Final = Reader(
+    "mcap", "an MCAP file", (".mcap",), _open, extra="logs", options=TOPICS | LISTS
+)

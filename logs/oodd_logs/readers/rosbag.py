@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from oodd_eval.errors import TrajectoryError
 from oodd_logs.readers import TOPICS, Options, Reader, chosen, library
-from oodd_logs.readers.gathered import topics_of
+from oodd_logs.readers.gathered import LISTS, recording_of
 from oodd_logs.recording import Recording
 
 _BORDER: Final = "=" * 80 + "\n"
@@ -34,10 +34,8 @@ def _open(path: Path, options: Options) -> Iterator[Recording]:
                 [c for c in bag.connections if c.topic in readable]
             )
         )
-        topics = topics_of(path, readable, messages)
-    if not topics:
-        raise TrajectoryError(f"{path} has no messages")
-    yield Recording(path.name if is_ros2 else path.stem, str(path), topics)
+        name = path.name if is_ros2 else path.stem
+        yield recording_of(path, name, readable, messages, options.get("lists", ()))
 
 
 def _types(connections: Sequence[Any]) -> Any:
@@ -79,6 +77,6 @@ READER: Final = Reader(
     (".bag",),
     _open,
     extra="logs",
-    options=TOPICS,
+    options=TOPICS | LISTS,
     directory_markers=("metadata.yaml",),
 )
