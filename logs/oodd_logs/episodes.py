@@ -25,7 +25,6 @@ from oodd_eval.names import check_known, counted
 from oodd_logs.ledger import Item, Ledger
 from oodd_logs.marks import AnomalousRows, IntervalList, merged, rows_of
 from oodd_logs.readers import in_order as natural_order
-from oodd_logs.readers import reader_for
 from oodd_logs.recipe import FAILURE, AnomalousFiles, Recipe, anomaly_name
 from oodd_logs.recorded import FILES, NOMINAL_ROLES, Recorded, StampedRows, text_of
 from oodd_logs.recording import Recording
@@ -40,6 +39,7 @@ from oodd_logs.selecting import (
     respellings,
     select_columns,
 )
+from oodd_logs.splitting import recordings_in
 from oodd_logs.stamps import Steps, Times, even_rate
 
 EVERY: Final = "every"
@@ -398,7 +398,7 @@ def _recordings(
             reading.ledger.add("file", "dropped", "no rows", source=relative)
             continue
         with _scan_goes_on(reading, relative, "file"):
-            for recording in reader_for(path, recipe.format).read(path, recipe.options):
+            for recording in recordings_in(path, recipe, lenient=reading.every):
                 yield Recorded(recording, path, relative, roles)
 
 

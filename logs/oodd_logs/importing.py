@@ -41,10 +41,11 @@ from oodd_logs.episodes import (
     read_episodes,
 )
 from oodd_logs.marks import IntervalList, read_intervals
-from oodd_logs.readers import reader_for, readers
+from oodd_logs.readers import readers
 from oodd_logs.recipe import AnomalousFiles, Interval, NominalFiles, Recipe
 from oodd_logs.recorded import Recorded
 from oodd_logs.selecting import layout_of, select_columns, unnamed_columns
+from oodd_logs.splitting import recordings_in, split_recording
 
 ONSETS: Final = "onsets.csv"
 """File beside those of a part that names their onsets."""
@@ -253,7 +254,7 @@ def _with_names(recipe: Recipe, sensors: Sequence[Quantity], actions: Sequence[Q
     if not sensors and not actions:
         return recipe
     path = matching_files(recipe.nominal.train, Path())[0]
-    recording = next(reader_for(path, recipe.format).read(path, recipe.options), None)
+    recording = next(recordings_in(path, recipe), None)
     if recording is None:
         raise UsageError(f"{path} has no episodes, expected at least one")
     selection = select_columns(layout_of(recording), recipe, recording.source)
@@ -356,7 +357,8 @@ def import_frames(
     recorded = [
         Recorded(recording, Path(title), title, frozenset(either if part == "test" else {part}))
         for part, episodes in parts.items()
-        for title, recording in recordings_of(part, episodes, recipe.time)
+        for title, table in recordings_of(part, episodes, recipe.time)
+        for recording in split_recording(table, recipe.episode)
     ]
     if not recipe.sensors and recorded:
         layout_ = layout_of(recorded[0].recording)

@@ -293,6 +293,9 @@ class Recipe:
     gap
         Seconds without a row beyond which a recording is cut; None refuses long gaps, and 0, for
         scans, cuts there.
+    episode
+        Columns that tell the episodes of a file apart: keys that have a value an episode, flags of
+        first or last rows, or a counter that starts anew; see `oodd_logs.splitting`.
     sensors, actions
         Globs over columns or ``topic.field``, in order; ``"new = old"`` renames, ``NAME[UNIT]``
         names the unit. Without sensors, the columns ``obs:NAME[UNIT]`` and ``action:NAME[UNIT]``.
@@ -355,6 +358,7 @@ class Recipe:
     time: Text = ""
     rate: Number = None
     gap: Number = None
+    episode: Texts = ()
     sensors: Texts = ()
     actions: Texts = ()
     reward: Text = ""
