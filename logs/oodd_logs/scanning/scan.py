@@ -6,11 +6,12 @@ Faults of the stream, such as frozen sensors, count as the statistic that would 
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
+from fnmatch import fnmatchcase
 from multiprocessing import get_context
-from typing import Any, Final, NamedTuple, cast
+from typing import Any, Final, Literal, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,6 +31,7 @@ from oodd_eval.names import counted
 from oodd_eval.plugins.contract import AnyDetector
 from oodd_eval.plugins.explanations import ExplainingDetector, Explanation, checked_explanation
 from oodd_logs.episodes import Episode
+from oodd_logs.ledger import Ledger
 from oodd_logs.marks import runs_of
 from oodd_logs.scanning.episode_faults import (
     CleanedEpisode,
@@ -52,6 +54,12 @@ from oodd_logs.scanning.outliers import (
 )
 
 Floats = NDArray[np.float64]
+
+Band = Literal["surely", "look at", "fine"]
+"""Under the promised rate; among the first of the ranking, or above all fine ones; the rest."""
+
+Progress = Callable[[str, Sequence[str]], None]
+"""Takes what is done, in words, and the names of episodes, the oddest first, as far as known."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,6 +92,12 @@ class ScannedEpisode:
         Share of each sensor in the evidence at that row, by name, the largest first.
     faults
         Of the stream: those that would make an episode odd, and gaps, which do not.
+    band
+        Whether it is odd (``"surely"``), or to be looked at.
+    place
+        In the ranking; 1 is the oddest.
+    reason
+        What is oddest about it, in a clause.
     """
 
     episode: Episode
@@ -100,6 +114,9 @@ class ScannedEpisode:
     intervals: tuple[tuple[int, int], ...]
     sensors: Mapping[str, float]
     faults: tuple[EpisodeFault, ...]
+    band: Band = "fine"
+    place: int = 1
+    reason: str = ""
 
     @property
     def first(self) -> int | None:
@@ -145,6 +162,9 @@ class ScannedEpisode:
             "source": self.episode.source,
             "rows": len(self.scores),
             "odd": self.odd,
+            "band": self.band,
+            "place": self.place,
+            "reason": self.reason,
             **{name: getattr(self, name) for name in figures},
             "first_odd_row": first,
             "first_odd_time": None if time is None or first is None else time[first],
@@ -175,6 +195,11 @@ class Scan:
         the tail is as light as assumed.
     notes
         What is to be known about it, a sentence each.
+    ledger
+        What became of the logs on their way here.
+    kinds_mixed
+        Whether more than a fifth would be called odd: the episodes are of several kinds then, and
+        none is odd.
     """
 
     episodes: Sequence[ScannedEpisode]
@@ -182,6 +207,13 @@ class Scan:
     judge: str
     fdr: float
     notes: Sequence[str]
+    ledger: Ledger = field(default_factory=Ledger)
+    kinds_mixed: bool = False
+
+    @property
+    def ranked(self) -> list[ScannedEpisode]:
+        """All episodes, the oddest first."""
+        return sorted(self.episodes, key=lambda scanned: scanned.place)
 
     @property
     def odd(self) -> list[ScannedEpisode]:
@@ -202,7 +234,10 @@ class Scan:
             "fdr": self.fdr,
             "sensors": list(self.sensors),
             "notes": list(self.notes),
+            "ledger": self.ledger.as_json(),
+            "kinds_mixed": self.kinds_mixed,
             "odd": [scanned.episode.name for scanned in self.odd],
+            "ranked": [scanned.episode.name for scanned in self.ranked],
             "episodes": [scanned.as_json() for scanned in self.episodes],
         }
 
@@ -230,6 +265,10 @@ def scan_episodes(
     horizon: int = 1,
     parameters: Mapping[str, Any] | None = None,
     jobs: int = 1,
+    fine: Sequence[str] = (),
+    first: int = 10,
+    progress: Progress | None = None,
+    ledger: Ledger | None = None,
 ) -> Scan:
     """Tell which of some recorded episodes are odd, and which of their rows and sensors.
 
@@ -263,6 +302,15 @@ def scan_episodes(
         default, ``forecast`` is ``"linear"`` unless it is given: networks would be fitted 20 times.
     jobs
         Fits at a time, in processes of their own where more than 1.
+    fine
+        Names of episodes that a person confirmed, or patterns such as ``"run-0*"``: the others are
+        compared with these, which are never odd.
+    first
+        Number of episodes that are to be looked at: the first of the ranking.
+    progress
+        Called when there is a first ranking, and after each pass.
+    ledger
+        What became of the logs so far.
 
     Returns
     -------
@@ -297,8 +345,9 @@ def scan_episodes(
         notes.append(f"Left out: {counted(count, 'episode(s)')} of fewer than {shortest} rows.")
     if not usable:
         raise UsageError(f"no episode of at least {shortest} rows: nothing to judge")
+    triage = fine, first, ledger or Ledger()
     if watchdog is not None:
-        return _scan_with(watchdog, usable, names, fdr, notes)
+        return _scan_with(watchdog, usable, names, fdr, notes, triage)
     if len(usable) < SHORTEST:
         rows = len(usable[0].observations)
         raise UsageError(
@@ -336,7 +385,33 @@ def scan_episodes(
             f"is kept; {LEAST} recordings would do."
         )
     name = handle.state["name"] or type(handle.detector).__name__
-    return _verdict(judged, names, _Terms(f"{name}, fitted on the other episodes", fdr, notes))
+    terms = _Terms(f"{name}, fitted on the other episodes", fdr, notes)
+    scan = _banded(_verdict(judged, names, terms), *triage)
+    if progress is not None:
+        progress("judged", [scanned.episode.name for scanned in scan.ranked])
+    return scan
+
+
+def _banded(scan: Scan, fine: Sequence[str], first: int, ledger: Ledger) -> Scan:
+    """Return the scan with bands, places and reasons."""
+
+    def oddness(scanned: ScannedEpisode) -> tuple[float, float]:
+        return math.inf if math.isnan(scanned.p) else scanned.p, -scanned.largest
+
+    places = {id(s): k for k, s in enumerate(sorted(scan.episodes, key=oddness), 1)}
+    mixed = len(scan.odd) > ODD_SHARE * len(scan.episodes) and len(scan.episodes) >= LEAST
+    episodes = []
+    for scanned in scan.episodes:
+        confirmed = any(fnmatchcase(scanned.episode.name, pattern) for pattern in fine)
+        odd, place = scanned.odd and not (mixed or confirmed), places[id(scanned)]
+        band: Band = "surely" if odd else "fine"
+        if not odd and not confirmed and (place <= first or scanned.odd):
+            band = "look at"
+        clauses = [f"{f.fault} {f.what} from row {f.row}" for f in scanned.faults]
+        clauses += [f"{name} from row {scanned.since}" for name in scanned.suspects[:1]]
+        clauses += [f"a statistic of {scanned.largest:.3g}"]
+        episodes.append(replace(scanned, odd=odd, band=band, place=place, reason=clauses[0]))
+    return replace(scan, episodes=episodes, ledger=ledger, kinds_mixed=mixed)
 
 
 def _with_faults(
@@ -406,7 +481,12 @@ def _rows(episode: Episode, start: int, stop: int) -> Episode:
 
 
 def _scan_with(
-    watchdog: Watchdog, episodes: list[Episode], names: list[str], fdr: float, notes: list[str]
+    watchdog: Watchdog,
+    episodes: list[Episode],
+    names: list[str],
+    fdr: float,
+    notes: list[str],
+    triage: tuple[Sequence[str], int, Ledger],
 ) -> Scan:
     """Let a watchdog judge all episodes, row by row as beside a robot."""
     unknown = [name for name in watchdog.sensors if name not in names]
@@ -430,7 +510,7 @@ def _scan_with(
         windows = reference.units > len({*calibration.recordings})
         enough = (reference.units + 1) * fdr >= len(episodes) and not windows
         terms = replace(terms, reference=reference, exact=enough and not calibration.rolling)
-    return _verdict(judged, watchdog.sensors, terms)
+    return _banded(_verdict(judged, watchdog.sensors, terms), *triage)
 
 
 def _watched(
