@@ -6,7 +6,8 @@ second call goes on where the first was interrupted. ``oodd-eval compare DIR --w
 makes of the results the records that are committed in ``leaderboard/suites/logs``.
 
 Without ``--root`` the page is filled: cards from the comments of the recipes, tables from the
-committed records where there are some. With ``--check`` it is compared and not written.
+committed records where there are some, and which part of a set and which release these are of from
+``sets.toml`` beside them. With ``--check`` it is compared and not written.
 """
 
 import argparse
@@ -14,6 +15,7 @@ import re
 import sys
 import textwrap
 import time
+import tomllib
 import warnings
 from pathlib import Path
 
@@ -31,6 +33,9 @@ from oodd_eval.scoring.promises import promises_of
 
 ROOT = Path(__file__).parents[1]
 PAGE, RECORDS = ROOT / "docs" / "public-logs.md", ROOT / "leaderboard" / "suites" / "logs"
+
+SETS = tomllib.loads((RECORDS / "sets.toml").read_text(encoding="utf-8"))
+"""The part of each set that the committed records are of, and their release."""
 
 ORDER = ("skab", "alfa", "rosa", "tep", "cwru", "nab", "ur3", "uci", "lerobot", "pi0")
 """Sets in the order of the page: labelled rows first, outcomes last."""
@@ -105,18 +110,24 @@ def run(name, root, detectors, results):
 
 
 def tables_of(records):
-    """Return the tables of each set, as Markdown, by its name."""
+    """Return the tables of each set, as Markdown behind what they are of, by its name."""
     sets = {Recipe.load(path).environment: name for name, path in shipped_recipes().items()}
     pages = {}
     for board in boards(records):
         (environment,) = board.environments
+        name = sets[environment]
         texts = [
             re.sub(r"^### (.*)", r"**\1**", markdown_table(table)).strip()
             for table in Tables(board).of_logs()
             if " by " not in table.title and "Metrics of rows" not in table.title
         ]
-        pages[sets[environment]] = "\n\n".join(texts)
-    return pages
+        (digest,) = {r.split_digest for r in records if r.environment == environment}
+        of = SETS[name]
+        release = of["release"] + (f", whose recipe had {of['recipe']}" if "recipe" in of else "")
+        head = f"Computed on {of['part']}, by release {release}; digest `{digest[:12]}`."
+        pages[name] = "\n\n".join([head, *texts])
+    none = "No table: its files were not at hand."
+    return {name: pages.get(name, none) for name in ORDER}
 
 
 def filled(page, **blocks):
