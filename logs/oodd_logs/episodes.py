@@ -328,17 +328,34 @@ def read_every_episode(recipe: Recipe, root: Path, files: Sequence[Path]) -> Epi
     TrajectoryError
         When a recording cannot be read; the message names file and row.
     """
-    stamped = recipe.time or recipe.rate is not None
-    gap = recipe.gap or (0.0 if stamped else None)
-    recipe = dataclasses.replace(recipe, missing="keep", gap=gap, paired=False)
     listed: dict[Path, set[str]] = {}
     for name, table in recipe.anomalous.items():
         for pattern in table.files:
             for path in names_matching(pattern, root):
                 listed.setdefault(root / path, set()).add(f"test/{name}")
-    reading = _Reading(recipe, IntervalList.of(recipe, root), every=True, root=root)
+    reading = _for_scan(recipe, root)
     roles = ((path, frozenset(listed.get(path, {FILES}))) for path in files)
     return _read(reading, _recordings(reading, roles))
+
+
+def make_every_episode(recipe: Recipe, recordings: Iterable[Recorded]) -> EpisodeSource:
+    """Make episodes of recordings as `read_every_episode` does.
+
+    Parameters
+    ----------
+    recipe
+        How rows become episodes.
+    recordings
+        What was recorded, in that order.
+    """
+    return _read(_for_scan(recipe, Path()), recordings)
+
+
+def _for_scan(recipe: Recipe, root: Path) -> "_Reading":
+    stamped = recipe.time or recipe.rate is not None
+    gap = recipe.gap or (0.0 if stamped else None)
+    recipe = dataclasses.replace(recipe, missing="keep", gap=gap, paired=False)
+    return _Reading(recipe, IntervalList.of(recipe, root), every=True, root=root)
 
 
 def matching_files(patterns: Sequence[str], root: Path) -> list[Path]:

@@ -298,9 +298,10 @@ def import_frames(
     name
         Name of the split, and of its environment unless `keys` name that.
     train, calibration
-        Nominal episodes. An episode is a data frame of pandas or polars with a row a step, an array
-        of shape (rows, sensors), a pair of such an array and one of actions, or a list of mappings
-        from columns to values.
+        Nominal episodes. An episode is a data frame of pandas or polars, or a table of arrow's,
+        with a row a step; an array of shape (rows, sensors), maybe masked or with named fields; a
+        pair of such an array and one of actions; a mapping from columns to their values, or a list
+        of mappings. Of lazy frames the rows are collected.
     test
         Test episodes by the name of their anomaly, ``"nominal"`` for nominal ones; or a list, in
         which those with anomalous labels are of the kind ``"anomaly"``.
@@ -357,7 +358,7 @@ def import_frames(
     recorded = [
         Recorded(recording, Path(title), title, frozenset(either if part == "test" else {part}))
         for part, episodes in parts.items()
-        for title, table in recordings_of(part, episodes, recipe.time)
+        for title, table in recordings_of(f"{part}-", episodes, recipe.time)
         for recording in split_recording(table, recipe.episode)
     ]
     if not recipe.sensors and recorded:

@@ -3,12 +3,10 @@
 import os
 import resource
 import tracemalloc
-import types
 
 import numpy as np
 import pytest
 from helpers_logs import write_table as write
-from oodd_logs import import_frames
 from oodd_logs.importing import import_data, import_recipe
 from oodd_logs.recipe import Recipe
 
@@ -179,82 +177,6 @@ onset = 30
 def moved(rows, offset):
     # Repr keeps all digits of float64.
     return {name: [repr(float(v) + offset / 10) for v in values] for name, values in rows.items()}
-
-
-# Frames
-
-
-def frame(columns):
-    pandas = pytest.importorskip("pandas")
-    return pandas.DataFrame(columns)
-
-
-def test_data_frames_arrays_and_mappings_become_the_same_split(tmp_path):
-    episodes = [walk(40, i) for i in range(12)]
-    odd = walk(40, 20, 5.0, 10, 15) | {"fault": labels(40, 10, 15).astype(bool)}
-    rows = [{name: values[t] for name, values in odd.items()} for t in range(40)]
-    digests = set()
-    for form, make in {
-        "frames": frame,
-        "rows": lambda e: [dict(zip(e, row, strict=True)) for row in zip(*e.values(), strict=True)],
-        "other library": Table,
-    }.items():
-        made = [make(e | {"fault": np.zeros(40, bool)}) for e in episodes]
-        split = import_frames(
-            "arm", train=made[:6], calibration=made[6:10],
-            test={"nominal": made[10:], "bump": [make(odd) if form != "rows" else rows]},
-            labels="fault", output=tmp_path / form, report=len,
-        )  # fmt: skip
-        digests.add(split.digest)
-        data = split.environment("arm")
-        assert data.labelled("bump").intervals == [((10, 15),)]
-        assert [q.name for q in data.sensors] == ["a", "b"]
-    assert len(digests) == 1
-    arrays = [np.stack([*e.values()], axis=1) for e in episodes]
-    data = import_frames("arm", train=arrays[:6], calibration=arrays[6:],
-                         output=tmp_path / "arrays", report=len).environment("arm")  # fmt: skip
-    assert np.array_equal(data.train[1].observations, arrays[1].astype(np.float32))
-
-
-class Table:
-    """What data frames of other libraries share: columns, and columns that become arrays."""
-
-    def __init__(self, columns):
-        self._columns, self.columns = columns, [*columns]
-
-    def __getitem__(self, name):
-        return types.SimpleNamespace(to_numpy=lambda: np.asarray(self._columns[name]))
-
-
-def test_frames_in_a_list_are_told_apart_by_their_labels_and_stamps_may_be_an_index(tmp_path):
-    pandas = pytest.importorskip("pandas")
-    times = pandas.date_range("2024-05-01", periods=40, freq="100ms", name="when")
-    frames = []
-    for i in range(10):
-        start, stop = (10, 15) if i == 9 else (0, 0)
-        columns = walk(40, i, 5.0, start, stop) | {"fault": labels(40, start, stop)}
-        frames.append(pandas.DataFrame(columns).set_index(times))
-    data = import_frames(
-        "arm", train=frames[:4], calibration=frames[4:7], test=frames[7:], labels="fault",
-        time="when", rate=10, environment="joint", output=tmp_path / "out", report=len,
-    ).environment("joint")  # fmt: skip
-    assert (len(data.twins), data.logs.rate) == (2, 10.0)
-    assert data.labelled("anomaly").intervals == [((10, 15),)]
-
-
-@pytest.mark.parametrize(
-    ("episode", "word"),
-    [
-        (np.zeros((3, 2, 2)), r"shape \(3, 2, 2\)"),
-        (np.array([["x"]]), "numbers"),
-        ((np.zeros((5, 2)), np.zeros((9, 1))), "5 observations and 9 actions"),
-    ],
-)
-def test_what_is_no_episode_is_refused(tmp_path, episode, word):
-    with pytest.raises(TrajectoryError, match=word):
-        import_frames("arm", train=[episode], calibration=[episode], output=tmp_path, report=len)
-    with pytest.raises(UsageError, match="import_frames 'windw'"):
-        import_frames("arm", train=[], calibration=[], windw=3, report=len)
 
 
 # Memory

@@ -19,18 +19,20 @@ from oodd_live.handle import DetectorHandle, has_actions
 from oodd_live.nominal import sensor_names
 from oodd_live.watchdog import Watchdog
 
+from oodd_eval.data.arrays import as_numbers
 from oodd_eval.data.baseline import Baseline
 from oodd_eval.data.bounded import without_nan
 from oodd_eval.data.facts import roles_of
 from oodd_eval.data.trajectory import Trajectory
-from oodd_eval.errors import ContractError, OoddError, UnknownNameError, UsageError
+from oodd_eval.errors import ContractError, OoddError, TrajectoryError, UnknownNameError, UsageError
 from oodd_eval.metrics.alarms import AlarmKind, GuaranteedAlarm, joined, numbered, window_weights
 from oodd_eval.metrics.cusum import Standardization
 from oodd_eval.metrics.faults import StreamScale
 from oodd_eval.names import counted
 from oodd_eval.plugins.contract import AnyDetector
 from oodd_eval.plugins.explanations import ExplainingDetector, Explanation, checked_explanation
-from oodd_logs.episodes import Episode
+from oodd_logs.episodes import EVERY, Episode
+from oodd_logs.frames import scanned_frames
 from oodd_logs.ledger import Ledger
 from oodd_logs.marks import runs_of
 from oodd_logs.scanning.episode_faults import (
@@ -253,7 +255,7 @@ Outcome = tuple[Floats, Explanation | None]
 
 
 def scan_episodes(
-    episodes: Sequence[Episode | ArrayLike],
+    episodes: Sequence[Any],
     *,
     sensors: Sequence[Any] | None = None,
     detector: AnyDetector = SCANNER,
@@ -278,10 +280,12 @@ def scan_episodes(
     Parameters
     ----------
     episodes
-        In recorded order: episodes as recipes read them, or arrays of shape (R, D) with NaN for
-        what is missing. A single one is cut into windows.
+        In recorded order: episodes as recipes read them, arrays of shape (R, D) with NaN for what
+        is missing, or data frames and the like as `import_frames` takes them. A single one is cut
+        into windows.
     sensors
-        Names, or quantities with names and roles; default "sensor 0" and so on.
+        Names, or quantities with names and roles; default all columns, "sensor 0" and so on where
+        they have no names.
     detector
         Name of an installed detector, a class or function that makes one, or an unfitted one.
         ``"panel"`` is `panel-a` where episodes have actions; ``parameters={"actions": "no"}``
@@ -332,7 +336,8 @@ def scan_episodes(
     """
     if not 0 < fdr < 1:
         raise UsageError(f"fdr={fdr!r}, expected a share between 0 and 1")
-    recorded = [_as_episode(episode, i) for i, episode in enumerate(episodes)]
+    ledger = ledger or Ledger()
+    recorded, sensors = _recorded(episodes, sensors, ledger)
     widths = sorted({episode.observations.shape[1] for episode in recorded})
     if len(widths) != 1:
         raise UsageError(f"episodes have {widths} sensors, expected the same number in all")
@@ -345,7 +350,7 @@ def scan_episodes(
         notes.append(f"Left out: {counted(count, 'episode(s)')} of fewer than {shortest} rows.")
     if not usable:
         raise UsageError(f"no episode of at least {shortest} rows: nothing to judge")
-    triage = fine, first, ledger or Ledger()
+    triage = fine, first, ledger
     if watchdog is not None:
         return _scan_with(watchdog, usable, names, fdr, notes, triage)
     if len(usable) < SHORTEST:
@@ -440,13 +445,28 @@ def _with_faults(
     return judged
 
 
+def _recorded(
+    episodes: Sequence[Any], sensors: Sequence[Any] | None, ledger: Ledger
+) -> tuple[list[Episode], Sequence[Any] | None]:
+    """Return episodes with their sensors; add what became of frames to the ledger."""
+    source = scanned_frames(episodes, sensors or ())
+    if source is None:
+        return [_as_episode(episode, i) for i, episode in enumerate(episodes)], sensors
+    with source:
+        ledger.merge(source.ledger)
+        return [*source.episodes(EVERY)], sensors or source.sensors
+
+
 def _as_episode(episode: Episode | ArrayLike, number: int) -> Episode:
     if isinstance(episode, Episode):
         return episode if episode.recording is not None else replace(episode, recording=number)
-    rows = np.asarray(episode, dtype=np.float64)
-    if rows.ndim != 2 or 0 in rows.shape:
-        raise UsageError(f"episode {number} has shape {rows.shape}, expected (rows, sensors)")
     name = f"episode {number}"
+    try:
+        rows = as_numbers(episode)
+    except TrajectoryError as error:
+        raise UsageError(f"{name}: {error}") from error
+    if rows.ndim != 2 or 0 in rows.shape:
+        raise UsageError(f"{name} has shape {rows.shape}, expected (rows, sensors)")
     return Episode(name, name, rows, np.empty((len(rows) - 1, 0)), None, recording=number)
 
 
