@@ -182,11 +182,11 @@ class TopicRows:
                 row = int(which.argmax())
                 cell = str(words[row]) or str(cells[row, j]) * bool(is_inf[row])
                 if self._policy == "refuse" and which.any():
+                    value = f"{cell!r:.60}" if is_text[row] else cell or reason
                     raise TrajectoryError(
-                        f"{self._source}, row {start + row}, column {name!r} is "
-                        f"{f'{cell!r:.60}' if is_text[row] else cell or reason}, expected a "
-                        f"finite number{self._shares.get(name, '')}: missing = 'hold' or 'drop' in a recipe "
-                        "says what to do"
+                        f"{self._source}, row {start + row}, column {name!r} is {value}, "
+                        f"expected a finite number{self._shares.get(name, '')}: missing = 'hold' "
+                        "or 'drop' in a recipe says what to do"
                     )
                 self._say("cell", "held", reason, name, int(which.sum()), start + row, cell)
             if self._policy == "keep":
