@@ -21,12 +21,13 @@ from oodd_eval.data.facts import ANOMALIES, Group, Quantity, in_order
 from oodd_eval.data.offsets import RunningMoments, is_coarse
 from oodd_eval.data.parts import CALIBRATION, TRAIN, TWINS
 from oodd_eval.errors import TrajectoryError, UnknownNameError, UsageError
+from oodd_eval.metrics.faults import FAR
 from oodd_eval.names import check_known, counted
 from oodd_logs.ledger import Item, Ledger
 from oodd_logs.marks import AnomalousRows, IntervalList, merged, rows_of
 from oodd_logs.readers import in_order as natural_order
 from oodd_logs.recipe import FAILURE, AnomalousFiles, Recipe, anomaly_name
-from oodd_logs.recorded import FILES, NOMINAL_ROLES, Recorded, StampedRows, text_of
+from oodd_logs.recorded import FILES, NOMINAL_ROLES, SLOWER, Recorded, StampedRows, text_of
 from oodd_logs.recording import Recording
 from oodd_logs.rows import Converter, Matrix, Spool, spool_stretch
 from oodd_logs.selecting import (
@@ -46,7 +47,7 @@ EVERY: Final = "every"
 """The part with all episodes of a source that `read_every_episode` made."""
 
 _ANOMALOUS: Final = "anomalous"  # where labels name no anomaly
-_SLOWER: Final = 1.5  # times the usual step, from which on a clock is of another unit
+_SAMPLED: Final = 1 << 22  # values that tell usual deviations
 _BLOCK: Final = 1 << 16  # rows that are read at once
 _NO_FILES: Final = AnomalousFiles()
 _SHARED: Final = (TRAIN, CALIBRATION, TWINS)
@@ -574,6 +575,8 @@ def _selected(reading: _Reading, recording: Recording) -> tuple[Selection, _Firs
             if reading.first is None:
                 raise
             raise TrajectoryError(f"{error}; {reading.first.source} has it") from None
+        except UsageError as error:
+            raise UsageError(f"{source}: {str(error).removeprefix(source)}") from None
         if reading.first is None:
             if discrete and not recipe.discrete:
                 names = tuple(map(str, recording.fields.get("choices", ())))
@@ -807,6 +810,7 @@ def _in_parts(reading: _Reading) -> EpisodeSource:
         source = _source(reading, reading.parts)
         if reading.by_stamps:
             source.parts[EVERY].sort(key=lambda facts: facts.begin)
+        _say_far(source)
         return source
     if reading.first is None:
         raise UsageError("there are no recordings to read, expected at least one")
@@ -837,6 +841,7 @@ def _in_parts(reading: _Reading) -> EpisodeSource:
     source = _source(reading, parts)
     groups = {kind: recipe.anomalous.get(kind, _NO_FILES).group for kind in kinds}
     source.groups = groups | {kind: ANOMALIES[kind].group for kind in kinds if kind in ANOMALIES}
+    _say_far(source)
     _settle_columns(source, recipe)
     source.notes[:0] = _notes(reading, source)
     if lacking:
@@ -879,7 +884,7 @@ def _say_of_all(reading: _Reading) -> None:
     for steps in reading.steps.values():
         median = float(np.median([s.usual for s in steps.values()]))
         for label, step in ((label, s.usual) for label, s in steps.items()):
-            if not median / _SLOWER < step < median * _SLOWER:
+            if not median / SLOWER < step < median * SLOWER:
                 reason = f"a row every {step:g} s, where others have one every {median:g} s"
                 reading.ledger.add("recording", "kept", reason, source=label)
 
@@ -947,6 +952,36 @@ def _notes(reading: _Reading, source: EpisodeSource) -> list[str]:
     return lines
 
 
+def _say_far(source: EpisodeSource) -> None:
+    """Name the rows of values that are no measurements by their size."""
+    every = [facts for episodes in source.parts.values() for facts in episodes]
+    width, total = len(source.sensors), sum(facts.rows for facts in every)
+    step = max(1, total * width // _SAMPLED)
+    sampled, largest = [np.zeros((0, width))], np.zeros(width)
+    for facts in every:
+        for rows in source.blocks(facts):
+            finite = np.where(np.isfinite(rows[:, :width]), rows[:, :width], np.nan)
+            largest = np.fmax(largest, np.nanmax(np.abs(finite), axis=0, initial=0.0))
+            sampled.append(finite[::step])
+    sample = np.concatenate(sampled)
+    for d, sensor in enumerate(source.sensors):
+        values = sample[~np.isnan(sample[:, d]), d]
+        low, centre, high = np.quantile(values, [0.05, 0.5, 0.95]) if len(values) else np.zeros(3)
+        most = FAR * (high - low) / 2 or np.inf
+        for facts in every if largest[d] + abs(centre) > most else []:
+            column = source.rows(facts, 0, facts.rows)[:, d]
+            for row in np.flatnonzero(np.abs(column - centre) > most).tolist():
+                source.ledger.add(
+                    "cell",
+                    "kept",
+                    "no measurement by its size",
+                    name=sensor.name,
+                    source=facts.name,
+                    row=row,
+                    cell=f"{column[row]:g}",
+                )
+
+
 def _settle_columns(source: EpisodeSource, recipe: Recipe) -> None:
     """Drop constant sensors if asked to, and find offsets of those that float32 cannot tell."""
     train = _moments(source, source.parts[TRAIN])
@@ -968,7 +1003,8 @@ def _settle_columns(source: EpisodeSource, recipe: Recipe) -> None:
     if (every.largest > np.finfo(np.float32).max / 2).any():
         i = int(every.largest.argmax())
         raise TrajectoryError(
-            f"sensor {source.sensors[i].name!r} reaches {every.largest[i]:g}, too large for float32"
+            f"sensor {source.sensors[i].name!r} reaches {every.largest[i]:g}, too large for "
+            f"float32{''.join(e.where() for e in source.ledger.of('cell', 'kept'))}"
         )
     blurred = is_coarse(spread, every.largest)
     if blurred.any():

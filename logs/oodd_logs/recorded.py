@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from oodd_eval.data.parts import CALIBRATION, TRAIN, TWINS
 from oodd_eval.errors import TrajectoryError, UnknownNameError, UsageError
-from oodd_logs.ledger import Fate, Ledger
+from oodd_logs.ledger import Fate, Item, Ledger
 from oodd_logs.marks import IntervalList, Mark, anomalous_cells, runs_of
 from oodd_logs.readers.cells import mixed
 from oodd_logs.recipe import Recipe, anomaly_name
@@ -18,6 +18,7 @@ from oodd_logs.recording import Recording, parse_times
 from oodd_logs.rows import TopicRows, read_column
 from oodd_logs.selecting import Selection, find_columns, layout_of, named_columns
 from oodd_logs.stamps import (
+    Steps,
     Stretch,
     Times,
     check_stamps,
@@ -29,6 +30,9 @@ from oodd_logs.stamps import (
 
 FILES: Final = "files"
 """Role of the nominal files whose episodes are shared out."""
+
+SLOWER: Final = 1.5
+"""Times the usual step, from which on a clock is another one."""
 
 NOMINAL_ROLES: Final = frozenset({FILES, TRAIN, CALIBRATION, TWINS})
 
@@ -179,9 +183,9 @@ class StampedRows:
                 times = np.empty(0) if is_strict else _tolerant(cells, column.quantity.unit, what)
                 if is_strict or 2 * np.isnan(times).sum() >= len(times):
                     raise
-            rows = np.flatnonzero(np.isnan(times))
+            rows = np.flatnonzero(~np.isfinite(times))
             cell = str(cells[rows[0]]) if len(rows) and cells.dtype.kind == "U" else ""
-            self._dropped("without a stamp", start + rows, cell, column.column)
+            self._say("dropped", "without a stamp", start + rows, cell, column.column)
             parsed.append(times)
         stamps = np.concatenate(parsed)
         missing = ~np.isfinite(stamps)
@@ -192,11 +196,20 @@ class StampedRows:
             )
         return stamps
 
-    def _dropped(self, reason: str, rows: NDArray[Any], cell: str = "", name: str = "") -> None:
+    def _say(
+        self,
+        fate: Fate,
+        reason: str,
+        rows: NDArray[Any],
+        cell: str = "",
+        name: str = "",
+        item: Item = "row",
+    ) -> None:
+        """Add rows by their numbers to the ledger, with the text in the first."""
         if len(rows):
             row, count, source = int(rows[0]), len(rows), self._recorded.label
             self._ledger.add(
-                "row", "dropped", reason, name=name, count=count, source=source, row=row, cell=cell
+                item, fate, reason, name=name, count=count, source=source, row=row, cell=cell
             )
 
     def stretches(self) -> tuple[list[Stretch], list[Times]]:
@@ -232,10 +245,10 @@ class StampedRows:
             is_kept = np.ones(len(rows), bool)
             if recipe.missing == "keep":  # whatever is recorded is judged
                 is_kept = times > np.append(-np.inf, np.maximum.accumulate(times)[:-1])
-                self._dropped("stamped before a row above it, or as it", rows[~is_kept])
+                self._say("dropped", "stamped before a row above it, or as it", rows[~is_kept])
             elif recipe.rate is not None:  # the later of two rows with one stamp holds
                 is_kept = times != np.append(times[1:], np.inf)
-                self._dropped("stamped as the row below it", rows[~is_kept])
+                self._say("dropped", "stamped as the row below it", rows[~is_kept])
             rows, times = rows[is_kept], times[is_kept]
             if not len(rows):
                 of_topic = f" of topic {name!r}" if name else ""
@@ -254,11 +267,27 @@ class StampedRows:
                 stretches.append(Stretch(len(rows), {name: rows}, timed[name][mask]))
             else:
                 stretch = on_grid(timed, first, last, recipe.rate, source)
+                for name, numbers in stretch.sources.items():
+                    self._say_of_grid(name, timed[name], usable[name], numbers)
                 sources = {n: usable[n][numbers] for n, numbers in stretch.sources.items()}
                 stretches.append(dataclasses.replace(stretch, sources=sources))
+        cuts = [stretch.sources[name][:1] for stretch in stretches[1:]]
+        self._say("changed", "cut at gaps or earlier stamps", np.concatenate([[], *cuts]))
         for name, mask in used.items():
-            self._dropped("where another topic has none", usable[name][~mask], name=name)
+            self._say("dropped", "where another topic has none", usable[name][~mask], name=name)
         return stretches, [*timed.values()]
+
+    def _say_of_grid(
+        self, topic: str, times: Times, rows: NDArray[np.int64], numbers: NDArray[np.int64]
+    ) -> None:
+        """Say which rows hold longer than one of the grid, or not at all, where rates agree."""
+        steps = Steps.of(times).usual * (self._recipe.rate or 0.0)
+        repeated = numbers[1:][np.diff(numbers) == 0]
+        if steps < SLOWER:
+            self._say("held", "longer than a row", rows[repeated], name=topic)
+        passed = np.setdiff1d(np.arange(numbers[0], numbers[-1]), numbers)
+        if steps > 1 / SLOWER:
+            self._say("dropped", "sooner than a row after others", rows[passed], name=topic)
 
     def marks(self, intervals: IntervalList, *, is_anomalous: bool) -> list[Mark]:
         """Return the anomalous rows, in seconds where there are stamps.
@@ -280,9 +309,12 @@ class StampedRows:
                 before = bool(blocks[-1][-1:].any())
                 blocks.append(anomalous_cells(labels, recipe, before=before))
             marks += [
-                self._mark(start, stop, kind, column.topic)
+                Mark(begin, end, kind)
                 for start, stop in runs_of(np.concatenate(blocks))
                 for kind in ([""] if text in recipe.labels else owners)
+                # Rows without stamps mark nothing.
+                if (begin := self._position(start, column.topic, "begin"))
+                < (end := self._position(stop, column.topic, "end"))
             ]
         for _, first, stop, kind in intervals.of_recording(
             recorded.path, recorded.recording.name, recorded.relative
@@ -311,18 +343,11 @@ class StampedRows:
         absent = ~present & ~is_text
         if not present.any():
             return cells
-        cases: tuple[tuple[NDArray[np.bool_], Fate, str], ...] = (
-            (absent, "held", "no label"),
-            (is_text, "kept", "a label that is text among numbers"),
-        )
-        for which, fate, reason in cases:
-            if which.any() and 2 * which.sum() < len(cells):
-                row, source = int(which.argmax()), self._recorded.label
-                cell, count = str(cells[row]) * bool(is_text[row]), int(which.sum())
-                place = {"source": source, "cell": cell}
-                self._ledger.add(
-                    "cell", fate, reason, name=name, count=count, row=start + row, **place
-                )
+        if 2 * absent.sum() < len(cells):
+            self._say("held", "no label", start + np.flatnonzero(absent), "", name, "cell")
+        if 2 * is_text.sum() < len(cells):
+            cell, rows = str(cells[is_text.argmax()]), start + np.flatnonzero(is_text)
+            self._say("kept", "a label that is text among numbers", rows, cell, name, "cell")
         return cells if is_text.any() else numbers
 
     def _listed(self, start: Any, stop: Any, kind: str) -> Mark:
@@ -340,8 +365,8 @@ class StampedRows:
                 )
         return mark
 
-    def _mark(self, start: Any, stop: Any, kind: str, topic: str = "") -> Mark:
-        topic = topic or self._selection.topics[0]
+    def _mark(self, start: Any, stop: Any, kind: str) -> Mark:
+        topic = self._selection.topics[0]
         begin = -np.inf if start is None else self._position(start, topic, "begin")
         end = np.inf if stop is None else self._position(stop, topic, "end")
         if not begin < end:
