@@ -63,7 +63,7 @@ def written(tmp_path, text, name="run.csv", encoding="utf-8"):
         ("t,x\n0,1.5\n1,-2e3\n", {"t": [0, 1], "x": [1.5, -2000]}),
         ("t;x\n0;1,5\n1;-2,25\n", {"t": [0, 1], "x": [1.5, -2.25]}),
         ("t\tx\n0\t1\n", {"t": [0], "x": [1]}),
-        ("t;x\n0;1.234\n1;2,5\n", {"t": [0, 1], "x": ["1.234", "2,5"]}),
+        ("t;x\n0;1.234\n1;2,5\n", {"t": [0, 1], "x": [1234, 2.5]}),
         ("t;x;y\n" + "0;1;1\n" * 200 + "0;2,5;1\n",
          {"t": [0] * 201, "x": [1] * 200 + [2.5], "y": [1] * 201}),
         ("t|x\n0|1\n", {"t": [0], "x": [1]}),
@@ -133,6 +133,91 @@ def test_options_say_how_a_csv_file_is_laid_out(tmp_path):
 def test_a_wrong_option_is_refused_with_what_is_expected(tmp_path, options, message):
     with pytest.raises(UsageError, match=message):
         recordings("csv", written(tmp_path, "t,x\n0,1\n"), **options)
+
+
+@pytest.mark.parametrize(
+    ("cells", "column", "said"),
+    [
+        (["980", "1.013", "1.020"], [980, 1013, 1020], "'.' stands between thousands: row 1"),
+        (["980", "1,013", "1,020"], [980, 1013, 1020], "',' stands between thousands"),
+        (["0.980", "1.013", "2"], [0.98, 1.013, 2], ""),
+        (["1.013", "1.02", "999"], [1.013, 1.02, 999], ""),
+        (["1.013", "1.027", "1.034"], [1.013, 1.027, 1.034], ""),
+        (["1.234", "3.456", "2"], [1.234, 3.456, 2], "may stand between thousands"),
+        (["1.013.250", "999", "7"], [1013250, 999, 7], "stands between thousands"),
+        (["1.013,5", "999", "7,25"], [1013.5, 999, 7.25], "stands between thousands"),
+        (["1,013.5", "999", "7.25"], [1013.5, 999, 7.25], "stands between thousands"),
+        (["1'013", "999", "7.25"], [1013, 999, 7.25], ""),
+        (["1\u202f013", "999", "7"], [1013, 999, 7], ""),
+        (["1.5", "#N/A", "2"], [1.5, np.nan, 2], "1 cell of x, a code for what is missing: "),
+        (["-nan(ind)", "1.#QNAN", "2"], [np.nan, np.nan, 2], "-nan(ind)"),
+        (["?", "-", "2"], [np.nan, np.nan, 2], "row 0"),
+        (["1.#INF", "1", "2"], [np.inf, 1, 2], ""),
+        (["open", "-", "shut"], ["open", "-", "shut"], ""),
+        (["?", "?", "?"], ["?", "?", "?"], ""),
+    ],
+)  # fmt: skip
+def test_a_column_is_read_as_its_numbers_are_written(tmp_path, cells, column, said):
+    path = written(tmp_path, "n;x\n" + "".join(f"{i};{cell}\n" for i, cell in enumerate(cells)))
+    (recording,) = recordings("csv", path)
+    assert rows(recording.topics[""])["x"] == pytest.approx(column, nan_ok=True)
+    assert said in "\n".join(recording.ledger.lines())
+    assert bool(said) == bool(recording.ledger)
+
+
+def test_a_mark_between_thousands_may_be_said(tmp_path):
+    path = written(tmp_path, "n;x\n0;1.013\n1;2.500\n")
+    assert rows(table("csv", path))["x"] == [1.013, 2.5]
+    assert rows(table("csv", path, thousands="."))["x"] == [1013, 2500]
+    path = written(tmp_path, "n;x\n0;980\n1;1.020\n")
+    assert rows(table("csv", path, thousands=False))["x"] == [980, 1.02]
+    with pytest.raises(UsageError, match="expected one of"):
+        table("csv", path, thousands=";")
+
+
+@pytest.mark.parametrize(
+    ("text", "columns", "said"),
+    [
+        ("t,p,n\ns,bar,-\n0,1,2\n1,3,4\n", {"t[s]": [0, 1], "p[bar]": [1, 3], "n": [2, 4]}, "bar"),
+        ("t;p\n[s];(bar)\n0;1,5\n1;3\n", {"t[s]": [0, 1], "p[bar]": [1.5, 3]}, "units"),
+        ("t,mode\n0,auto\n1,auto\n", {"t": [0, 1], "mode": ["auto", "auto"]}, ""),
+        ("mode,kind\na,b\nc,d\ne,f\n", {"mode": ["a", "c", "e"], "kind": ["b", "d", "f"]}, ""),
+        ("t,x\n#N/A,?\n1,2\n3,4\n", {"t": [np.nan, 1, 3], "x": [np.nan, 2, 4]}, "code"),
+        ("t,x\n0,1\n2,3\n\0\0\0\0", {"t": [0, 2], "x": [1, 3]}, "zero bytes are left out"),
+        ("t,x\n0,1\n\0\0\0" + "2,3\n", {"t": [0, 2], "x": [1, 3]}, "zero bytes"),
+        ("t,x\n0,1\n2,\0\0\0\0" + "4\n5,6\n", {"t": [0, 5], "x": [1, 6]}, "zero bytes are in its"),
+        ("t,x\n0,1\n2,3\n4", {"t": [0, 2], "x": [1, 3]}, "the last line is cut"),
+        ("t,x\n0,1\n2,3\n4\n", {"t": [0, 2, 4], "x": [1, 3, np.nan]}, ""),
+        ("obs:x,action:u\n0,1\n2", {"obs:x": [0, 2], "action:u": [1, np.nan]}, ""),
+    ],
+)  # fmt: skip
+def test_what_a_logger_left_around_its_rows_is_said(tmp_path, text, columns, said):
+    (recording,) = recordings("csv", written(tmp_path, text))
+    cells = rows(recording.topics[""])
+    assert [*cells] == [*columns]
+    for name, column in columns.items():
+        assert cells[name] == pytest.approx(column, nan_ok=True)
+    assert said in "\n".join(recording.ledger.lines())
+    assert bool(said) == bool(recording.ledger)
+
+
+def test_a_line_of_units_may_be_a_row_and_zero_bytes_may_be_many(tmp_path):
+    cells = rows(table("csv", written(tmp_path, "t,p\ns,bar\n0,1\n2,3\n"), units=False))
+    assert cells == {"t": ["s", "0", "2"], "p": ["bar", "1", "3"]}
+    assert rows(table("csv", written(tmp_path, "t,p\n0,1\n" + "\0" * 10**7)))["p"] == [1]
+
+
+def test_codes_of_a_recipe_are_missing_in_every_format(tmp_path):
+    path = written(tmp_path, "x,y,mode\n1,err,on\n-999,2,err\n3,4,off\n")
+    cells = rows(table("csv", path, missing_codes=[-999, "err"]))
+    assert cells["x"] == pytest.approx([1, np.nan, 3], nan_ok=True)
+    assert cells["y"] == pytest.approx([np.nan, 2, 4], nan_ok=True)
+    assert cells["mode"] == ["on", "", "off"]
+    np.savez(tmp_path / "run.npz", t=np.arange(3), x=[1, -999, 3])
+    cells = rows(table("numpy", tmp_path / "run.npz", missing_codes=[-999]))
+    assert cells["x"] == pytest.approx([1, np.nan, 3], nan_ok=True)
+    with pytest.raises(UsageError, match="expected a list of numbers and texts"):
+        table("csv", path, missing_codes=-999)
 
 
 def npy(header, content=b""):
@@ -690,7 +775,7 @@ def check_imu(topic, *, stamps=True):
          {"ranges.least": 2, "ranges.mean": 154 / 39, "ranges.count": 39}),
         ({"a": 1, "image": [7] * 5000, "data": b"png", "text": "x" * 2000}, {"a": 1}),
     ],
-    ids=str,
+    ids=lambda value: next(iter(value)),
 )  # fmt: skip
 def test_values_in_messages_have_names_and_not_places(message, columns):
     gathered = Gathered("run")
@@ -710,8 +795,12 @@ def test_rows_of_changing_parts_are_one_table():
         folded.add({"beams": [1] * 50})
     cells = rows(gathered.topic())
     nan = np.nan
-    expected = {"position.hip": [3, nan, 3, nan, nan, nan],
-                "position.gripper": [nan] * 4 + [7, nan], "hits.x.count": [nan, 2, nan, 2, nan, 1], "log_time": [2, nan] * 3}  # fmt: skip
+    expected = {
+        "position.hip": [3, nan, 3, nan, nan, nan],
+        "position.gripper": [nan, nan, nan, nan, 7, nan],
+        "hits.x.count": [nan, 2, nan, 2, nan, 1],
+        "log_time": [2, nan, 2, nan, 2, nan],
+    }
     for name, column in expected.items():
         assert cells[name] == pytest.approx(column, nan_ok=True)
     assert cells["mode"] == ["", "on", "", "on", "", "1.25"]

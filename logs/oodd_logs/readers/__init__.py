@@ -28,6 +28,8 @@ from oodd_eval.errors import (
     UsageError,
 )
 from oodd_eval.names import check_known
+from oodd_logs.kinds import missing_codes
+from oodd_logs.readers.cells import check_width, without_codes
 from oodd_logs.recording import Column, Recording, Topic
 
 Options = Mapping[str, Any]
@@ -97,7 +99,8 @@ class Reader:
         path
             The file or directory.
         options
-            Those of `options` that a recipe sets.
+            Those of `options` that a recipe sets; ``missing_codes``, numbers and texts that stand
+            for missing values, in every format.
 
         Yields
         ------
@@ -113,6 +116,8 @@ class Reader:
         TrajectoryError
             When the content cannot be read. Reading rows raises it, too.
         """
+        options = dict(options)
+        codes = missing_codes.check(missing_codes.KEY, options.pop(missing_codes.KEY, []))
         check_known(f"option of the format {self.name}", self.options, *options)
         if not path.exists():
             raise UsageError(f"{str(path)!r} does not exist, expected {self.part}")
@@ -122,8 +127,10 @@ class Reader:
             raise TrajectoryError(f"{path} is no plain file")
         with readable(path):
             for recording in self.open(path, options):
+                check_width(recording.source, sum(len(t.names) for t in recording.topics.values()))
                 topics = {name: _guarded(t, recording) for name, t in recording.topics.items()}
-                yield dataclasses.replace(recording, topics=topics)
+                guarded = dataclasses.replace(recording, topics=topics)
+                yield without_codes(guarded, codes) if codes else guarded
 
 
 def readers() -> Mapping[str, Reader]:

@@ -1,6 +1,7 @@
 """Cells of text: numbers, truth values, what is missing, and names of columns."""
 
 import contextlib
+import dataclasses
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -13,7 +14,7 @@ from oodd_eval.data.bounded import EPISODE
 from oodd_eval.errors import TrajectoryError
 from oodd_eval.names import is_plain
 from oodd_logs.kinds import read_texts
-from oodd_logs.recording import MISSING, Column
+from oodd_logs.recording import MISSING, Column, Recording, Topic
 
 WIDEST: Final = 2**14
 """Columns that a recording may have."""
@@ -59,7 +60,7 @@ def number(cell: str, decimal: str = ".") -> float:
     return value
 
 
-def numbers(cells: Sequence[str], decimal: str = ".") -> Column | None:
+def numbers(cells: Sequence[str], decimal: str = ".", *, strict: bool = False) -> Column | None:
     """Return the numbers of a column; None where a cell holds something else.
 
     Parameters
@@ -68,20 +69,31 @@ def numbers(cells: Sequence[str], decimal: str = ".") -> Column | None:
         Cells of the column.
     decimal
         What stands before the decimals: a point, a comma, or, for empty, either in all cells.
+    strict
+        Whether texts that only a kind of columns knows are something else. They are anyway where
+        no other cell is a number.
     """
     if not decimal:
-        column = numbers(cells, ".")
-        return numbers(cells, ",") if column is None else column
+        column = numbers(cells, ".", strict=strict)
+        return numbers(cells, ",", strict=strict) if column is None else column
     try:
         if decimal == ".":  # the quick way for numbers alone
             column = np.array([*map(float, cells)], np.float64)
             return column if all(map(is_plain, cells)) else None
     except ValueError:
         pass
-    try:
-        values = {cell: number(cell, decimal) for cell in {*cells}}
-    except ValueError:
+    values: dict[str, float] = {}
+    read: dict[str, float] = {}
+    for cell in {*cells}:
+        try:
+            values[cell] = number(cell, decimal)
+        except ValueError:
+            if strict or not (known := read_texts([cell])):
+                return None
+            read |= known
+    if read and not any(np.isfinite([*values.values(), *read.values()])):
         return None
+    values |= read
     return np.fromiter(map(values.__getitem__, cells), np.float64, len(cells))
 
 
@@ -179,3 +191,37 @@ def column_names(names: Iterable[str]) -> tuple[str, ...]:
         taken.add(label)
         unique.append(label)
     return tuple(unique)
+
+
+def without_codes(recording: Recording, codes: Sequence[float | str]) -> Recording:
+    """Return a recording in which cells with one of some numbers or texts are missing.
+
+    A column whose other cells are numbers is one of numbers then.
+    """
+    topics = {name: _without(topic, codes) for name, topic in recording.topics.items()}
+    return dataclasses.replace(recording, topics=topics)
+
+
+def _without(topic: Topic, codes: Sequence[float | str]) -> Topic:
+    figures = [float(code) for code in codes if not isinstance(code, str)]
+    words = [*{code.strip() for code in codes if isinstance(code, str)}, *map(str, codes)]
+    worded: dict[str, bool] = {}
+
+    def plain(cells: Column) -> Column:
+        if cells.dtype.kind == "U":
+            return np.where(np.isin(cells, words), "", cells)
+        return np.where(np.isin(cells, figures), np.nan, cells)
+
+    def read(names: Sequence[str], start: int, stop: int) -> dict[str, Column]:
+        columns = {}
+        for name, cells in topic.read(names, start, stop).items():
+            columns[name] = plain(cells)
+            if columns[name].dtype.kind == "U":
+                if name not in worded:  # for all of its rows, whatever this range has
+                    every = plain(topic.read([name], 0, topic.rows)[name])
+                    worded[name] = numbers(every.tolist(), "") is None
+                column = None if worded[name] else numbers(columns[name].tolist(), "")
+                columns[name] = columns[name] if column is None else column
+        return columns
+
+    return dataclasses.replace(topic, read=read)

@@ -12,15 +12,18 @@ import re
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TextIO
 
 import numpy as np
 
 from oodd_eval.data.bounded import EPISODE, LINE_CHARACTERS
 from oodd_eval.errors import TrajectoryError, UsageError
-from oodd_logs.readers import TRANSPOSE, Options
-from oodd_logs.readers.cells import column_names, number, numbers, texts
-from oodd_logs.recording import Column, Topic
+from oodd_logs.kinds import read_texts
+from oodd_logs.kinds.number_marks import MARKS, has_thousands, may_have_thousands, without_marks
+from oodd_logs.ledger import Ledger
+from oodd_logs.readers import TRANSPOSE, Options, is_transposed
+from oodd_logs.readers.cells import check_width, column_names, number, numbers, texts
+from oodd_logs.recording import Column, Recording, Topic
 
 BLANKS: Final = " "
 """Separator that stands for any number of blanks and tabs."""
@@ -28,10 +31,12 @@ BLANKS: Final = " "
 OPTIONS: Final = {
     "separator": "character between cells, or a blank for any number of blanks and tabs",
     "decimal": "character before decimals: . or ,",
+    "thousands": "character between thousands: . , ' or a blank; false for none",
     "encoding": "of the text, by default UTF-8, or what a byte order mark says",
     "skip": "number of lines before the header",
     "header": "false where the first line holds values, true where it holds names",
     "names": "list of names for the columns, in place of the header's",
+    "units": "false where no line with units stands below the header",
     **TRANSPOSE,
 }
 
@@ -40,6 +45,9 @@ _PIECE: Final = 2**16
 _SAMPLE: Final = 100  # lines from which the layout is recognised
 _DECIMAL_COMMA: Final = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 _DECIMAL_POINT: Final = re.compile(r"[+-]?\d*\.\d+([eE][+-]?\d+)?")
+_THREE_DIGITS: Final = re.compile(r"[+-]?[1-9]\d{0,2}([.,]\d{3})+")
+_ZEROS: Final = re.compile("\0+")
+_LAST: Final = ("action:", "reward", "column ")  # what a last row may lack
 _DATE: Final = re.compile(r"\d{4}-\d\d-\d\d|\d\d?:\d\d")
 
 _Cells = Column | list[str]
@@ -61,6 +69,10 @@ class Layout:
         Lines before the first row.
     names
         Names of the columns.
+    thousands
+        What stands between thousands: empty for nothing, None where columns tell.
+    units
+        Cells of a line with units below the header, of those of which `names` have them.
     """
 
     separator: str
@@ -68,14 +80,16 @@ class Layout:
     encoding: str
     lines: int
     names: tuple[str, ...]
+    thousands: str | None = None
+    units: tuple[str, ...] = ()
 
     def split(self, lines: Sequence[str]) -> list[list[str]]:
         """Return the cells of lines; lines without any are left out."""
         return _split(lines, self.separator)
 
 
-def table(path: Path, options: Options, separator: str = "") -> Topic:
-    """Return the rows of a file as a topic.
+def table_recording(path: Path, options: Options, separator: str = "") -> Recording:
+    """Return a file as a recording with one topic.
 
     Parameters
     ----------
@@ -93,25 +107,78 @@ def table(path: Path, options: Options, separator: str = "") -> Topic:
     TrajectoryError
         When rows have different numbers of cells, or the file is no text.
     """
-    layout = layout_of(path, options, separator)
-    blocks = _columns(path, layout)
-    worded = {i for block in blocks for i, cells in enumerate(block) if isinstance(cells, list)}
-    if worded and len(blocks) > 1:
+    ledger = Ledger()
+    if is_transposed(path, options):
+        topic = _transposed(path, options, separator)
+    else:
+        layout = layout_of(path, options, separator)
+        topic = Topic.of(_table(path, layout, ledger))
+        if layout.units:
+            said = f"units of the columns, it seems: {', '.join(layout.units)}"[:200]
+            ledger.add("row", "changed", f"{said} ([read] units = false keeps the line as a row)")
+    return Recording(path.stem, str(path), {"": topic}, ledger=ledger)
+
+
+def _table(path: Path, layout: Layout, ledger: Ledger) -> dict[str, Column]:
+    """Return the columns of a file, and say what became of its cells."""
+    every, notes = range(len(layout.names)), Ledger()
+    worded = {*every} if layout.thousands else set[int]()
+    blocks = _columns(path, layout, worded, notes)
+    worded = {i for i in every for block in blocks if isinstance(block[i], list)}
+    if layout.thousands is None and layout.separator != ",":
+        joined = {i: np.concatenate([b[i] for b in blocks]) for i in every if i not in worded}
+        worded |= {i for i, column in joined.items() if may_have_thousands(column)}
+    if any(not isinstance(block[i], list) for block in blocks for i in worded):
         # One text, however late, makes texts of all cells of its column.
-        blocks = _columns(path, layout, worded)
+        notes = Ledger()
+        blocks = _columns(path, layout, worded, notes)
+    ledger.merge(notes)
     columns: dict[str, Column] = {}
     for i, name in enumerate(layout.names):
         parts: list[Any] = [block[i] for block in blocks]
         if i in worded:
-            columns[name] = texts([*itertools.chain(*parts)], f"{path}, column {name!r}")
+            cells = [*itertools.chain(*parts)]
+            column = _column(cells, name, layout, ledger)
+            columns[name] = texts(cells, f"{path}, column {name!r}") if column is None else column
         else:
             column = np.concatenate([np.empty(0), *parts])
             if name != f"column {i + 1}" or not len(column) or not np.isnan(column).all():
                 columns[name] = column
-    return Topic.of(columns)
+    return columns
 
 
-def transposed_table(path: Path, options: Options, separator: str = "") -> Topic:
+def _column(cells: list[str], name: str, layout: Layout, ledger: Ledger) -> Column | None:
+    """Return the numbers of a column in which not all cells are plain ones; None for texts."""
+    decimal, marks = layout.decimal, [layout.thousands] if layout.thousands else []
+    if layout.thousands is None:
+        said = {mark: has_thousands(cells, mark, decimal) for mark in ".,"}
+        marks = [mark for mark in said if said[mark] and mark != layout.separator]
+        if unsure := [mark for mark, verdict in said.items() if verdict is None]:
+            reason = (
+                f"{unsure[0]!r} before three digits may stand between thousands: [read] thousands"
+            )
+            ledger.add("column", "kept", reason, name=name)
+    for mark in marks:
+        other = "," if mark == "." else decimal if decimal not in {"", mark} else "."
+        column = numbers([without_marks(cell, mark, other) for cell in cells], other)
+        row = next((i for i, cell in enumerate(cells) if without_marks(cell, mark) != cell), None)
+        if column is not None and row is not None:
+            reason = f"{mark!r} stands between thousands"
+            ledger.add("column", "changed", reason, name=name, row=row, cell=cells[row])
+        if column is not None:
+            return column
+    column = numbers(cells, decimal)
+    if column is not None:
+        absent = np.flatnonzero(np.isnan(column)).tolist()
+        coded = [row for row in absent if numbers([cells[row]], strict=True) is None]
+        for code in dict.fromkeys(cells[row] for row in coded):
+            rows = [row for row in coded if cells[row] == code]
+            place = {"count": len(rows), "row": rows[0], "cell": code}
+            ledger.add("cell", "changed", "a code for what is missing", name=name, **place)
+    return column
+
+
+def _transposed(path: Path, options: Options, separator: str) -> Topic:
     """Return a file as a topic of which each line is a column, perhaps with its name in front."""
     encoding = _encoding(path, options)
     if path.stat().st_size > EPISODE.most // 4:
@@ -140,8 +207,8 @@ def layout_of(path: Path, options: Options, separator: str = "") -> Layout:
     encoding = _encoding(path, options)
     with path.open(encoding=encoding) as text:
         raw = []
-        for line in iter(lambda: text.readline(LINE_CHARACTERS + 1), ""):
-            raw.append(_bounded(line, path))
+        for line in iter(lambda: _line(text, path), ""):
+            raw.append(_without_zeros(line, Ledger()))
             if len(raw) == _SAMPLE or sum(map(len, raw)) > LINE_CHARACTERS:
                 break
     first = _whole(options, "skip")
@@ -158,18 +225,20 @@ def layout_of(path: Path, options: Options, separator: str = "") -> Layout:
     decimal = _decimal(rows, mark_of_cells, options)
     head = rows[0]
     # A row of values has numbers, and perhaps times, and nothing else.
-    words = [cell for cell in head if numbers([cell], decimal) is None]
+    words = [cell for cell in head if numbers([cell], decimal, strict=True) is None]
     is_data = len(words) < len(head) and all(map(_DATE.match, words)) and any(map(str.strip, head))
     header = options.get("header", not is_data)
     if not isinstance(header, bool):
         raise UsageError(f"header is {header!r}, expected true or false")
     names: Sequence[str] = [*map(str, range(len(head)))]
+    units: list[str] = []
     if header:
         names = head
-        # Names may have line ends within quotes.
-        reader = csv.reader(lines, delimiter=mark_of_cells)
-        next(reader, None)
-        first += 1 if mark_of_cells == BLANKS else max(1, reader.line_num)
+        if options.get("units", True) is not False:
+            units = _units(rows, decimal)
+        first += _line_of("".join(lines), 1 if units else 0, mark_of_cells)
+        if units:
+            names = [_with_unit(n, u) for n, u in itertools.zip_longest(head, units, fillvalue="")]
     elif comment.startswith(("#", "%")) and "header" not in options:
         above = _split([comment[1:].lstrip()], mark_of_cells)[0]
         names = above if len(above) == len(head) else names
@@ -177,13 +246,52 @@ def layout_of(path: Path, options: Options, separator: str = "") -> Layout:
         names = [names[0][1:], *names[1:]]
         if not names[0].strip() and [len(row) for row in rows[1:2]] == [len(names) - 1]:
             names = names[1:]
-    return Layout(mark_of_cells, decimal, encoding, first, _names(options, names, len(names), path))
+    check_width(path, len(names))
+    labels = _names(options, names, len(names), path)
+    thousands = _thousands(options, mark_of_cells)
+    if thousands and decimal in {thousands, ""}:
+        decimal = "," if thousands == "." else "."
+    return Layout(mark_of_cells, decimal, encoding, first, labels, thousands, tuple(units))
 
 
-def _columns(path: Path, layout: Layout, worded: Collection[int] = ()) -> list[list[_Cells]]:
+def _thousands(options: Options, separator: str) -> str | None:
+    thousands = options.get("thousands")
+    if thousands not in {None, False, *MARKS} or (thousands and thousands == separator):
+        expected = f"one of {', '.join(map(repr, MARKS))} that is no separator, or false"
+        raise UsageError(f"thousands is {thousands!r}, expected {expected}")
+    return "" if thousands is False else thousands
+
+
+def _units(rows: Sequence[Sequence[str]], decimal: str) -> list[str]:
+    """Return the cells of a line of units below the header; none where values begin there."""
+
+    def is_value(cell: str) -> bool:
+        return bool(_DATE.match(cell)) or numbers([cell], decimal, strict=True) is not None
+
+    units, below = [cell.strip() for cell in rows[1]] if len(rows) > 2 else [], rows[2:]
+    words = [i for i, cell in enumerate(units) if cell not in {"", "-", "1"}]
+    if len(units) > len(rows[0]) or any(
+        is_value(units[i]) or read_texts([units[i]]) for i in words
+    ):
+        return []
+    columns = {i: [row[i] for row in below if i < len(row) and row[i].strip()] for i in words}
+    numeric = [i for i in words if columns[i] and all(map(is_value, columns[i]))]
+    repeated = any(units[i] in map(str.strip, columns[i]) for i in words)
+    return units if numeric and 2 * len(numeric) >= len(words) and not repeated else []
+
+
+def _with_unit(name: str, unit: str) -> str:
+    """Return the name of a column with a unit in brackets, unless it has one or there is none."""
+    plain = unit.strip("[]()<> ")
+    return name if "[" in name or plain in {"", "-", "1"} or "[" in plain else f"{name}[{plain}]"
+
+
+def _columns(
+    path: Path, layout: Layout, worded: Collection[int], ledger: Ledger
+) -> list[list[_Cells]]:
     """Return the columns of each block: numbers where all of its cells are, and not `worded`."""
     blocks, size = [], 0
-    for block in _blocks(path, layout):
+    for block in _blocks(path, layout, ledger):
         columns = block.columns(worded)
         size += 8 * len(columns) * len(columns[0])
         if size > 4 * EPISODE.most:
@@ -193,24 +301,53 @@ def _columns(path: Path, layout: Layout, worded: Collection[int] = ()) -> list[l
     return blocks
 
 
-def _blocks(path: Path, layout: Layout) -> Iterator["_Block"]:
+def _blocks(path: Path, layout: Layout, ledger: Ledger) -> Iterator["_Block"]:
     with path.open(encoding=layout.encoding) as file:
         for _ in range(line := layout.lines):
-            file.readline(LINE_CHARACTERS + 1)
+            _line(file, path)
         last = False
         while not last:
             # In pieces: reading reserves as much memory as it is asked for.
-            pieces = iter(lambda: file.read(_PIECE), "")
-            text = "".join(itertools.islice(pieces, -(-_BLOCK // _PIECE)))
-            text += _bounded(file.readline(LINE_CHARACTERS + 1), path)
+            pieces = [*itertools.islice(iter(lambda: file.read(_PIECE), ""), -(-_BLOCK // _PIECE))]
+            last = sum(map(len, pieces)) < _BLOCK
+            text = "".join(_ZEROS.sub("\0", piece) for piece in pieces) + _line(file, path)
             extra = len(text) + LINE_CHARACTERS
             # A line may end within quotes.
             while text.count('"') % 2 and len(text) < extra and (more := file.readline(2**16)):
                 text += more
-            last = len(text) < _BLOCK
             if text:
-                yield _Block(path, layout, text, line, last)
+                yield _Block(path, layout, _without_zeros(text, ledger), line, last, ledger)
             line += text.count("\n")
+
+
+def _line(file: TextIO, path: Path) -> str:
+    """Return a line of a file, with one zero byte for any number of them."""
+    line = ""
+    for piece in iter(lambda: file.readline(LINE_CHARACTERS + 1), ""):
+        line += _ZEROS.sub("\0", piece)
+        if line.endswith("\n") or len(line) > LINE_CHARACTERS:
+            break
+    if len(line) > LINE_CHARACTERS:
+        raise EPISODE.failure(f"{path}: a line has more than {LINE_CHARACTERS} characters")
+    return line
+
+
+def _without_zeros(text: str, ledger: Ledger) -> str:
+    """Return a text without zero bytes, which are where a logger lost its power.
+
+    A line that they cut is left out; one that begins behind them is kept.
+    """
+    if "\0" not in text:
+        return text
+    lines = text.splitlines(keepends=True)
+    for i, line in enumerate(lines):
+        head, _, rest = line.lstrip("\0").partition("\0")
+        if head.strip() and (rest or "\0" in line.lstrip("\0")):
+            ledger.add("row", "dropped", "zero bytes are in its line", cell=head)
+        if "\0" in line:
+            lines[i] = line.lstrip("\0") if "\0" not in line.lstrip("\0") else "\n"
+    ledger.add("file", "changed", "zero bytes are left out")
+    return "".join(lines)
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,6 +359,7 @@ class _Block:
     text: str
     line: int
     last: bool
+    ledger: Ledger
 
     def columns(self, worded: Collection[int]) -> list[_Cells]:
         """Return the cells of each column: numbers where all are, and not `worded`, else texts."""
@@ -232,6 +370,9 @@ class _Block:
         if self.last:
             while rows and not any(rows[-1]):
                 rows.pop()
+            if rows and self._is_cut(rows[-1]):
+                cell = self.layout.separator.join(rows.pop())
+                self.ledger.add("row", "dropped", "the last line is cut", cell=cell)
         width = len(self.layout.names)
         if {*map(len, rows)} - {width}:
             rows = [
@@ -240,7 +381,7 @@ class _Block:
             ]
         columns: list[_Cells] = []
         for i, cells in enumerate(zip(*rows, strict=True)):
-            column = None if i in worded else numbers(cells, self.layout.decimal)
+            column = None if i in worded else numbers(cells, self.layout.decimal, strict=True)
             columns.append([*cells] if column is None else column)
         return columns or [np.empty(0) for _ in range(width)]
 
@@ -252,6 +393,8 @@ class _Block:
         layout, width = self.layout, len(self.layout.names)
         try:
             (row,) = layout.split([end])
+            if self.last and self._is_cut(row):
+                return None
             cells = [number(cell, layout.decimal) for cell in row + [""] * (width - len(row))]
             source = body
             if layout.decimal == ",":
@@ -267,6 +410,12 @@ class _Block:
         if not any(row) or len(cells) != width or above.shape[1] != width:
             return None
         return [*np.concatenate([above, [cells]]).T]
+
+    def _is_cut(self, row: list[str]) -> bool:
+        """Tell whether the last row ends where it stands, and lacks more than commands."""
+        lacking = self.layout.names[len(row) :]
+        ended = self.text.endswith("\n") or all(n.startswith(_LAST) for n in lacking)
+        return not ended
 
     def _fitted(self, row: list[str], i: int, end: bool) -> list[str]:
         """Return a row with as many cells as the header; empty cells may be missing at the end."""
@@ -284,12 +433,6 @@ class _Block:
         )
 
 
-def _bounded(line: str, path: Path) -> str:
-    if len(line) > LINE_CHARACTERS:
-        raise EPISODE.failure(f"{path}: a line has more than {LINE_CHARACTERS} characters")
-    return line
-
-
 def _encoding(path: Path, options: Options) -> str:
     """Return the encoding that the options or the file's first bytes say."""
     encoding = options.get("encoding", "utf-8")
@@ -303,7 +446,7 @@ def _encoding(path: Path, options: Options) -> str:
         head = file.read(4096)
     if head.startswith((b"\xff\xfe", b"\xfe\xff")):
         return "utf-16"
-    if "encoding" not in options and b"\0" in head:
+    if "encoding" not in options and b"\0" in head.lstrip(b"\0").partition(b"\n")[0]:
         raise TrajectoryError(f"{path} is no text: there are zero bytes in its first line")
     return "utf-8-sig" if head.startswith(b"\xef\xbb\xbf") else str(encoding)
 
@@ -350,11 +493,13 @@ def _decimal(rows: Sequence[Sequence[str]], separator: str, options: Options) ->
         if decimal not in {".", ","} or decimal == separator:
             raise UsageError(f"decimal is {decimal!r}, expected '.' or ',', and no separator")
         return str(decimal)
-    cells = {cell.strip() for row in rows for cell in row}
-    points = any(map(_DECIMAL_POINT.fullmatch, cells))
-    if points or separator == ",":
+    if separator == ",":
         return "."
-    return "," if any(map(_DECIMAL_COMMA.fullmatch, cells)) else ""
+    # A mark before three digits may stand between thousands.
+    cells = {cell.strip() for row in rows for cell in row}
+    cells = {cell for cell in cells if not _THREE_DIGITS.fullmatch(cell)}
+    points, commas = (any(map(p.fullmatch, cells)) for p in (_DECIMAL_POINT, _DECIMAL_COMMA))
+    return "." if points else "," if commas else ""
 
 
 def _names(options: Options, names: Sequence[str], count: int, path: Path) -> tuple[str, ...]:

@@ -11,17 +11,15 @@ from oodd_eval.data.bounded import EPISODE, LINE_CHARACTERS
 from oodd_eval.errors import TrajectoryError
 from oodd_logs.readers import Options, Reader, is_transposed
 from oodd_logs.readers.cells import column_names, numbers
-from oodd_logs.readers.tables import BLANKS, OPTIONS, layout_of, table, transposed_table
+from oodd_logs.readers.tables import BLANKS, OPTIONS, layout_of, table_recording
 from oodd_logs.recording import Recording, Topic
 
 
 def _open(path: Path, options: Options) -> Iterator[Recording]:
-    if is_transposed(path, options):
-        yield Recording(path.stem, str(path), {"": transposed_table(path, options, BLANKS)})
-    elif _has_classes(path, options):
+    if not is_transposed(path, options) and _has_classes(path, options):
         yield from _blocks(path, options)
     else:
-        yield Recording(path.stem, str(path), {"": table(path, options, BLANKS)})
+        yield table_recording(path, options, BLANKS)
 
 
 def _has_classes(path: Path, options: Options) -> bool:
