@@ -24,6 +24,9 @@ LISTS: Final = {"lists": "globs of long lists in messages whose items are column
 TIME: Final = "log_time"
 """Column with the seconds since 1970 at which a message was logged."""
 
+RECOVERED: Final = "it was never closed: recovered up to where it breaks off"
+"""What became of a recording whose recorder was killed."""
+
 _DEEPEST: Final = 16
 _MARK: Final = ".\0"  # in the name of a list, where the number of an item goes
 _PENDING: Final = 2**17  # cells that are not yet in arrays
@@ -199,6 +202,8 @@ def _unpacked(value: Any) -> Any:
     """Return a message of ROS as a mapping, and a number of NumPy as one of Python."""
     if isinstance(value, np.generic):
         return value.item()
+    if isinstance(value, bytes | bytearray) and len(value) <= number_lists.LONGEST:
+        return [*value]
     if isinstance(value, SimpleNamespace) and hasattr(value, "__slots__"):
         return {key: getattr(value, key) for key in value.__slots__}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -212,7 +217,9 @@ def recording_of(
     name: str,
     topics: Iterable[str],
     messages: Iterable[tuple[str, int, Any]],
-    lists: Sequence[str] = (),
+    *,
+    lists: Sequence[str],
+    ledger: Ledger,
 ) -> Recording:
     """Return a recording of messages; topics without any are left out.
 
@@ -225,13 +232,14 @@ def recording_of(
     messages
         Topic, nanoseconds since 1970, and what `Gathered.add` takes.
     lists
-        See `Gathered`; below their topics.
+        See `Gathered`.
+    ledger
+        Takes what became of values in messages; the recording has it.
     """
     rows = {topic: Gathered(f"{path}, {topic}", lists) for topic in topics}
     for topic, stamp, value in messages:
         rows[topic].add(value, stamp / 1e9)
     filled = {topic: gathered.topic(TIME) for topic, gathered in rows.items() if gathered.rows}
-    ledger = Ledger()
     for topic in filled:
         for entry in rows[topic].ledger:
             label = f"{topic}.{entry.name}"

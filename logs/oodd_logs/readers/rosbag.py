@@ -1,41 +1,147 @@
 """Bags of ROS 2, directories with a database or MCAP files, and of ROS 1, files."""
 
+import contextlib
+import io
+import itertools
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
+from oodd_eval.data.bounded import EPISODE
 from oodd_eval.errors import TrajectoryError
-from oodd_logs.readers import TOPICS, Options, Reader, chosen, library
-from oodd_logs.readers.gathered import LISTS, recording_of
+from oodd_logs.ledger import Ledger
+from oodd_logs.readers import TOPICS, Options, Reader, chosen, in_order, library
+from oodd_logs.readers.gathered import LISTS, RECOVERED, recording_of
 from oodd_logs.recording import Recording
 
 _BORDER: Final = "=" * 80 + "\n"
 _WORD: Final = re.compile(r"[A-Za-z0-9_/]*")
 
 
+Messages = Callable[[Sequence[Any]], Iterator[tuple[Any, int, bytes]]]
+"""Called with connections; yields these, nanoseconds, and messages."""
+
+
 def _open(path: Path, options: Options) -> Iterator[Recording]:
     library("rosbags.typesys")
-    is_ros2 = path.is_dir()
-    with library(f"rosbags.rosbag{1 + is_ros2}").Reader(path) as bag:
-        selected = chosen(dict.fromkeys(c.topic for c in bag.connections), options)
-        store = _types(bag.connections)
-        defined = {c.topic for c in bag.connections if c.msgtype in store.fielddefs}
-        undefined = [name for name in selected if name not in defined]
-        if len(undefined) == len(selected) or ("topics" in options and undefined):
-            raise TrajectoryError(
-                f"{path}: definitions of {', '.join(undefined) or 'any topic'} are missing"
-            )
-        readable = [name for name in selected if name in defined]
-        decode = store.deserialize_cdr if is_ros2 else store.deserialize_ros1
-        messages = (
-            (connection.topic, stamp, decode(raw, connection.msgtype))
-            for connection, stamp, raw in bag.messages(
-                [c for c in bag.connections if c.topic in readable]
-            )
+    databases = sorted(path.glob("*.db3"), key=lambda file: in_order(file.name))
+    if path.suffix.lower() == ".db3":
+        databases = [path]
+    if not databases or (path / "metadata.yaml").exists():
+        bag = library(f"rosbags.rosbag{1 + path.is_dir()}").Reader(path)
+        try:
+            bag.open()
+        except Exception:
+            if path.is_dir() and not databases:
+                raise
+        else:
+            with contextlib.closing(bag):
+                yield _recording(path, path, options, bag.connections, bag.messages, Ledger())
+            return
+    ledger = Ledger()
+    ledger.add("recording", "changed", RECOVERED)
+    if not databases:
+        connections, messages = _unindexed(path)
+        yield _recording(path, path, options, connections, messages, ledger)
+    # Parts of one recording are numbered.
+    for _, files in itertools.groupby(databases, lambda file: re.sub(r"_\d+$", "", file.stem)):
+        with contextlib.ExitStack() as stack:
+            parts = []
+            for file in files:
+                parts.append(library("rosbags.rosbag2.storage_sqlite3").Sqlite3Reader(file))
+                parts[-1].open()
+                stack.callback(parts[-1].close)
+            source = file if len(parts) < len(databases) else path
+            connections = [c for part in parts for c in part.connections]
+            yield _recording(source, path, options, connections, _joined(parts), ledger)
+
+
+def _recording(
+    source: Path,
+    path: Path,
+    options: Options,
+    connections: Sequence[Any],
+    messages: Messages,
+    ledger: Ledger,
+) -> Recording:
+    """Return the messages of a bag, by its connections."""
+    selected = chosen(dict.fromkeys(c.topic for c in connections), options)
+    store = _types(connections)
+    defined = {c.topic for c in connections if c.msgtype in store.fielddefs}
+    undefined = [name for name in selected if name not in defined]
+    if len(undefined) == len(selected) or ("topics" in options and undefined):
+        raise TrajectoryError(
+            f"{path}: definitions of {', '.join(undefined) or 'any topic'} are missing"
         )
-        name = path.name if is_ros2 else path.stem
-        yield recording_of(path, name, readable, messages, options.get("lists", ()))
+    for name in undefined:
+        ledger.add("column", "dropped", "its messages have no definition", name=name)
+    is_ros1 = path.suffix.lower() == ".bag"
+    decode = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
+    readable = [c for c in connections if c.topic in selected and c.topic in defined]
+    decoded = ((c.topic, stamp, decode(raw, c.msgtype)) for c, stamp, raw in messages(readable))
+    topics = [name for name in selected if name in defined]
+    name = source.name if source.is_dir() else source.stem
+    lists = options.get("lists", ())
+    return recording_of(source, name, topics, decoded, lists=lists, ledger=ledger)
+
+
+def _joined(parts: Sequence[Any]) -> Messages:
+    """Return the messages of databases, each up to where it breaks."""
+
+    def messages(connections: Sequence[Any]) -> Iterator[tuple[Any, int, bytes]]:
+        for part in parts:
+            owned = [c for c in connections if c in part.connections]
+            with contextlib.suppress(library("apsw").Error):
+                yield from part.messages(owned) if owned else ()
+
+    return messages
+
+
+def _unindexed(path: Path) -> tuple[list[Any], Messages]:
+    """Return the connections and messages of a bag of ROS 1 without its index, read in a row."""
+    rosbag = library("rosbags.rosbag1.reader")
+
+    def records() -> Iterator[tuple[Any, int, bytes]]:
+        bag, connections = rosbag.Reader(path), dict[int, Any]()
+        with path.open("rb") as file:
+            if not file.readline(100).startswith(b"#ROSBAG V2.0"):
+                raise TrajectoryError(f"{path} is no bag of version 2.0")
+            with contextlib.suppress(rosbag.ReaderError, OSError, EOFError, ValueError):
+                while True:
+                    yield from records_at(file, bag, connections)
+
+    def records_at(file: Any, bag: Any, connections: dict[int, Any]) -> Iterator[Any]:
+        """Yield what the next record holds: connections with the stamp -1, or messages."""
+        start, header = file.tell(), rosbag.Header.read(file)
+        kind = header.get_uint8("op")
+        if kind == rosbag.RecordType.CONNECTION:
+            file.seek(start)
+            bag.bio = file
+            connection = bag.read_connection()
+            connections[connection.id] = connection
+            yield connection, -1, b""
+            return
+        size = rosbag.read_uint32(file)
+        EPISODE.check(str(path), np.dtype("u1"), size)
+        content = rosbag.read_bytes(file, size)
+        if kind == rosbag.RecordType.MSGDATA:
+            yield connections[header.get_uint32("conn")], header.get_time("time"), content
+        elif kind == rosbag.RecordType.CHUNK:
+            EPISODE.check(str(path), np.dtype("u1"), header.get_uint32("size"))
+            inner = io.BytesIO(rosbag.decompressors[header.get_string("compression")](content))
+            while inner.tell() < len(inner.getbuffer()):
+                yield from records_at(inner, bag, connections)
+
+    connections = {c.id: c for c, stamp, _ in records() if stamp < 0}
+
+    def messages(selected: Sequence[Any]) -> Iterator[tuple[Any, int, bytes]]:
+        names = {connection.id for connection in selected}
+        return (record for record in records() if record[1] >= 0 and record[0].id in names)
+
+    return [*connections.values()], messages
 
 
 def _types(connections: Sequence[Any]) -> Any:
@@ -73,10 +179,10 @@ def _check_words(value: Any) -> None:
 
 READER: Final = Reader(
     "rosbag",
-    "the directory of a bag of ROS 2, or a .bag file of ROS 1",
-    (".bag",),
+    "the directory or .db3 file of a bag of ROS 2, or a .bag file of ROS 1",
+    (".bag", ".db3"),
     _open,
     extra="logs",
     options=TOPICS | LISTS,
-    directory_markers=("metadata.yaml",),
+    directory_markers=("metadata.yaml", "*.db3"),
 )
