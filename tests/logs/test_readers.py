@@ -2,9 +2,11 @@
 
 import functools
 import gzip
+import io
 import json
 import math
 import struct
+import zipfile
 
 import h5py
 import numpy as np
@@ -226,6 +228,14 @@ def npy(header, content=b""):
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text + content
 
 
+def many_members(count):
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        for i in range(count):
+            archive.writestr(f"{i}.npy", b"")
+    return file.getvalue()
+
+
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
@@ -251,6 +261,8 @@ def npy(header, content=b""):
          "expected numbers"),
         ("x.npy", b"\x93NUMPY\x01", "cannot be read"),
         ("x.npz", b"PK\x03\x04", "cannot be read"),
+        ("x.npz", many_members(20_000), "has 20000 arrays, limit 16384"),
+        ("x.csv", b"a," * 20_000 + b"b\n", "has 20001 columns or more, limit 16384"),
         ("x.mat", b"no file of MATLAB", r"x\.mat"),
         ("x.ulg", b"ULog", r"x\.ulg"),
     ],
@@ -586,7 +598,7 @@ def test_arrays_without_observations_are_a_table(tmp_path):
     ("arrays", "message"),
     [
         ({"obs": np.zeros((4, 2)), "action": np.zeros((9, 1))}, "action has shape"),
-        ({"obs": np.zeros((4, 2, 2))}, "obs has shape"),
+        ({"obs": np.zeros((4, 20_000))}, "has 20000 columns or more"),
         ({"gain": np.array(1.0)}, "expected arrays with a row a step"),
         ({"obs": np.array([{"a": 1}], dtype=object)}, "obs has dtype"),  # never unpickled
     ],
@@ -626,14 +638,19 @@ def test_a_file_of_robomimic_is_its_demonstrations(tmp_path):
             demo["dones"] = [0, 0, 0, 1]
             demo["obs/eef_pos"], demo["obs/gripper"] = np.full((4, 3), i), np.zeros(4)
             demo["next_obs/eef_pos"] = np.zeros((4, 3))
+            demo["obs/camera"], demo["obs/depth"] = np.zeros((4, 9, 9, 3), "u1"), np.ones((4, 6, 6))
+            demo["obs/pose"] = np.arange(16.0).reshape(4, 2, 2)
             demo.attrs["model_file"] = "<xml/>" * 1000
     first, second = recordings("hdf5", tmp_path / "lift.hdf5")
     assert (first.name, first.fields) == ("demo_0", {})
     assert {*second.topics[""].names} == {
         "obs:eef_pos.0", "obs:eef_pos.1", "obs:eef_pos.2", "obs:gripper", "action:action 0",
-        "action:action 1", "reward", "dones",
+        "action:action 1", "reward", "dones", "obs:pose.0.0", "obs:pose.0.1", "obs:pose.1.0",
+        "obs:pose.1.1", "obs:depth.least", "obs:depth.mean", "obs:depth.count",
     }  # fmt: skip
+    assert {e.name for e in second.ledger.of("column", "dropped")} == {"obs/camera", "next_obs"}
     cells = rows(second.topics[""])
+    assert (cells["obs:pose.1.0"], cells["obs:depth.count"]) == ([2, 6, 10, 14], [36] * 4)
     assert cells["obs:eef_pos.2"] == [1, 1, 1, 1]
     assert cells["action:action 1"] == pytest.approx([1, 1, 1, np.nan], nan_ok=True)
 

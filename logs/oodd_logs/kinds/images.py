@@ -11,7 +11,8 @@ from oodd_logs.kinds.number_lists import LONGEST
 LONGEST_TEXT: Final = 1000
 """Characters of a text that is kept; longer ones are images, too, or documents."""
 
-_PIXELS: Final = 4096  # whole numbers up to 255 in a list
+PIXELS: Final = 4096
+"""Numbers from which on a matrix in a row is an image, as is a list of whole ones up to 255."""
 
 
 def _flatten(_name: str, value: Any) -> Iterable[tuple[str, Any]] | None:
@@ -24,7 +25,7 @@ def _flatten(_name: str, value: Any) -> Iterable[tuple[str, Any]] | None:
         return () if value.dtype.itemsize == 1 and value.size > LONGEST else None
     if isinstance(value, list) and len(value) > LONGEST and isinstance(value[0], Mapping | list):
         return None
-    if isinstance(value, list) and len(value) > _PIXELS:
+    if isinstance(value, list) and len(value) > PIXELS:
         pixels = all(type(x) is int and 0 <= x < 256 for x in value)
         return () if pixels else None
     return None

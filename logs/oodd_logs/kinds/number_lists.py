@@ -11,7 +11,8 @@ from oodd_logs.kinds import Kind
 LONGEST: Final = 32
 """Numbers of a list that become columns, if every row has as many."""
 
-_FIGURES: Final = ("least", "mean", "count")
+FIGURES: Final = ("least", "mean", "count")
+"""Figures of a long list, as names of columns end."""
 
 
 def figures(name: str, rows: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
@@ -27,7 +28,7 @@ def figures(name: str, rows: NDArray[np.float64]) -> dict[str, NDArray[np.float6
         mean = np.where(finite, flat, 0.0).sum(axis=1) / count
     least = np.where(finite, flat, np.inf).min(axis=1, initial=np.inf)
     least[count == 0] = np.nan
-    return {f"{name}.{f}": x for f, x in zip(_FIGURES, (least, mean, count), strict=True)}
+    return {f"{name}.{f}": x for f, x in zip(FIGURES, (least, mean, count), strict=True)}
 
 
 def is_folded(name: str, size: int) -> bool:

@@ -50,14 +50,17 @@ def read_groups(
     for group in groups:
         source = str(path) if group == "/" else f"{path}, group {group.strip('/')}"
         fields = _fields(file, group, source)
-        arrays: dict[str, MatrixRows] = dict(_arrays(file, group, "", 0))
+        skipped: dict[str, str] = {}
+        arrays: dict[str, MatrixRows] = dict(_arrays(file, group, "", 0, skipped))
         if "terminations" in arrays:
             fields["terminated"] = bool(np.any(arrays.pop("terminations")[:]))
         if transposed:
             arrays = {k: _Transposed(a) if len(a.shape) == 2 else a for k, a in arrays.items()}
-        topic, single = episode_of(arrays, source, sensors, actions)
+        topic, single, ledger = episode_of(arrays, source, sensors, actions)
+        for name, reason in skipped.items():
+            ledger.add("column", "dropped", reason, name=name)
         name = path.stem if group == "/" else group.rpartition("/")[2]
-        yield Recording(name, source, {"": topic}, {**single, **fields, **(further or {})})
+        yield Recording(name, source, {"": topic}, {**single, **fields, **(further or {})}, ledger)
 
 
 class _Transposed:
@@ -85,18 +88,19 @@ def _episodes(file: StoredFile, group: str, depth: int) -> list[str]:
 
 
 def _arrays(
-    file: StoredFile, group: str, prefix: str, depth: int
+    file: StoredFile, group: str, prefix: str, depth: int, skipped: dict[str, str]
 ) -> Iterator[tuple[str, MatrixRows]]:
-    """Yield the arrays below a group by their names relative to the episode."""
-    # Left out are those that repeat others, shifted by a row, and texts.
+    """Yield the arrays below a group by their names relative to the episode; note others."""
     for name, rows in file.members(group).items():
         if name in _LEFT_OUT:
-            continue
-        if rows is not None and not rows.dtype.hasobject:
+            skipped[f"{prefix}{name}"] = "it repeats others, or is no measurement"
+        elif rows is not None and rows.dtype.hasobject:
+            skipped[f"{prefix}{name}"] = "texts in an array"
+        elif rows is not None:
             yield f"{prefix}{name}", rows
         elif rows is None and depth < _DEEPEST:
             inner = f"{group.rstrip('/')}/{name}"
-            yield from _arrays(file, inner, f"{prefix}{name}/", depth + 1)
+            yield from _arrays(file, inner, f"{prefix}{name}/", depth + 1, skipped)
 
 
 def _fields(file: StoredFile, group: str, source: str) -> dict[str, Any]:

@@ -72,9 +72,9 @@ def _episode(
         return {"": rows.topic()}, fields, rows.ledger
     if any(isinstance(v, list) and v and isinstance(v[0], list) for v in value.values()):
         arrays = {k: np.asarray(v) for k, v in value.items() if isinstance(v, list)}
-        topic, fields = episode_of(cast("Mapping[str, MatrixRows]", arrays), source)
+        topic, fields, ledger = episode_of(cast("Mapping[str, MatrixRows]", arrays), source)
         fields |= {k: v for k, v in value.items() if not isinstance(v, list)}
-        return {"": topic}, fields, Ledger()
+        return {"": topic}, fields, ledger
     return None
 
 

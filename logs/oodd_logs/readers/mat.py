@@ -34,8 +34,8 @@ def _open(path: Path, options: Options) -> Iterator[Recording]:
         plain[name] = array.T if transposed else array
         if 1 in array.shape:
             plain[name] = array.ravel() if array.size > 1 else array.reshape(())
-    topic, fields = episode_of(plain, str(path))
-    yield Recording(path.stem, str(path), {"": topic}, fields)
+    topic, fields, ledger = episode_of(plain, str(path))
+    yield Recording(path.stem, str(path), {"": topic}, fields, ledger)
 
 
 def _version_5(path: Path, options: Options) -> Arrays:

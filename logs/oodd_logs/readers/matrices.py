@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from oodd_eval.data.bounded import EPISODE
 from oodd_eval.data.facts import Quantity
 from oodd_eval.errors import TrajectoryError
-from oodd_logs.readers.cells import column_names
+from oodd_logs.kinds import images, number_lists
+from oodd_logs.ledger import Ledger
+from oodd_logs.readers.cells import check_width, column_names
 from oodd_logs.recording import Column, Topic
 
 _OBSERVATIONS: Final = ("observations", "observation", "obs")
@@ -38,10 +40,10 @@ class MatrixRows(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class _Part:
-    """A column of an array."""
+    """A column of an array: the place of its numbers in a row, or the figure of all of them."""
 
     array: str
-    column: int | None
+    column: tuple[int, ...] | str
 
 
 def episode_of(
@@ -49,13 +51,14 @@ def episode_of(
     source: str,
     sensors: Sequence[Quantity] = (),
     actions: Sequence[Quantity] = (),
-) -> tuple[Topic, dict[str, Any]]:
-    """Return the rows of an episode, and what holds for all of it.
+) -> tuple[Topic, dict[str, Any], Ledger]:
+    """Return the rows of an episode, what holds for all of it, and what became of arrays.
 
     Observations, actions and rewards are known by their usual names, ``obs/NAME`` among them; other
     arrays of their length are columns under their names. Actions and rewards are those of
     transitions: they lack the last row, and where they have it, what it led to was not recorded, so
-    that it counts as missing. What is no array of that length is a field.
+    that it counts as missing. What is no array of that length is a field. Images are left out, and
+    other long matrices in each row become figures.
 
     Parameters
     ----------
@@ -89,25 +92,28 @@ def episode_of(
                               "with a row a step, such as observations")  # fmt: skip
     parts: dict[str, _Part] = {}
     fields: dict[str, Any] = {}
+    ledger = Ledger()
     for name, array in arrays.items():
         kind, length = names[name], len_of(array)
-        fits = length in {rows, rows - 1} and len(array.shape) in {1, 2}
+        fits = length in {rows, rows - 1} and len(array.shape) > 0
         if not fits and kind:
             raise TrajectoryError(
-                f"{source}: {name} has shape {array.shape}, expected {rows} or {rows - 1} rows, "
-                "and one number or a row of numbers in each"
+                f"{source}: {name} has shape {array.shape}, expected {rows} or {rows - 1} rows"
             )
         if not fits or array.dtype.kind not in _KINDS:
             if len(array.shape) < 2 and (not array.shape or length <= _LONGEST_FIELD):
                 values = np.asarray(array[:] if array.shape else array[()])
                 fields[name] = values.item() if values.size == 1 else values.tolist()
+            else:
+                shape = f"no numbers in {rows} rows: shape {array.shape}, {array.dtype}"
+                ledger.add("column", "dropped", shape, name=name)
             continue
         quantities = {"obs": sensors, "action": actions}.get(kind, ())
-        width = array.shape[1] if len(array.shape) == 2 else None
-        for i in range(1 if width is None else width):
-            parts[_label(name, kind, i, width, quantities)] = _Part(
-                name, None if width is None else i
-            )
+        size = math.prod(array.shape[1:])
+        places = _places(name, array, ledger)
+        check_width(source, len(parts) + len(places))
+        for place in places:
+            parts[_label(name, kind, place, size, quantities)] = _Part(name, place)
     labels = dict(zip(column_names(parts), parts.values(), strict=True))
 
     def read(selected: Sequence[str], start: int, stop: int) -> dict[str, Column]:
@@ -120,29 +126,48 @@ def episode_of(
         columns = {}
         for label in selected:
             part = labels[label]
-            block = blocks[part.array]
-            column = np.asarray(block if part.column is None else block[:, part.column], np.float64)
+            block = np.asarray(blocks[part.array], np.float64)
+            if isinstance(part.column, str):
+                column = number_lists.figures("", block)[f".{part.column}"]
+            else:
+                column = block[:, *part.column]
             if stop == rows and names[part.array] in {"action", "reward"}:
                 column = column[: rows - 1 - start]
             columns[label] = np.append(column, np.full(stop - start - len(column), np.nan))
         return columns
 
-    return Topic(tuple(labels), rows, read), fields
+    return Topic(tuple(labels), rows, read), fields, ledger
 
 
-def _label(name: str, kind: str, i: int, width: int | None, quantities: Sequence[Quantity]) -> str:
-    inner = name.partition("/")[2].replace("/", ".")
+def _places(
+    name: str, array: MatrixRows, ledger: Ledger
+) -> Sequence[tuple[int, ...]] | Sequence[str]:
+    """Return the columns of an array: places in a row, figures, or none of an image."""
+    size = math.prod(array.shape[1:])
+    if len(array.shape) > 2 and size > number_lists.LONGEST:
+        if array.dtype.itemsize == 1 or size > images.PIXELS:
+            ledger.add("column", "dropped", images.KIND.words, name=name)
+            return ()
+        ledger.add("column", "changed", number_lists.KIND.words, name=name)
+        return number_lists.FIGURES
+    return [*np.ndindex(*array.shape[1:])]
+
+
+def _label(
+    name: str, kind: str, place: tuple[int, ...] | str, width: int, quantities: Sequence[Quantity]
+) -> str:
+    """Return the name of a column; observations and actions have those of quantities, if any."""
     if kind == "reward":
         return kind
-    if not kind:
-        plain = name.replace("/", ".")
-        return plain if width is None else f"{plain}.{i}"
+    steps = (place,) if isinstance(place, str) else place
+    inner = (name.partition("/")[2] if kind else name).replace("/", ".")
+    prefix = f"{kind}:" if kind else ""
     if inner:
-        return f"{kind}:{inner}" if width is None else f"{kind}:{inner}.{i}"
-    if len(quantities) == (1 if width is None else width):
-        unit = "" if quantities[i].unit == "1" else f"[{quantities[i].unit}]"
-        return f"{kind}:{quantities[i].name}{unit}"
-    return f"{kind}:{'sensor' if kind == 'obs' else kind} {i}"
+        return prefix + ".".join((inner, *map(str, steps)))
+    if len(quantities) == width and len(steps) < 2:
+        quantity = quantities[steps[0] if steps else 0]  # type: ignore[index]  of one number each
+        return prefix + quantity.name + ("" if quantity.unit == "1" else f"[{quantity.unit}]")
+    return f"{prefix}{'sensor' if kind == 'obs' else kind} {'.'.join(map(str, steps or (0,)))}"
 
 
 def len_of(array: MatrixRows) -> int:

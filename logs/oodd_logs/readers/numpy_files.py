@@ -6,13 +6,16 @@ from typing import Any, Final, cast
 
 import numpy as np
 
-from oodd_eval.data.bounded import EPISODE, Bounds, npy_header, read_npz
+from oodd_eval.data.bounded import EPISODE, npy_header, read_npz
 from oodd_eval.errors import TrajectoryError
 from oodd_logs.readers import TRANSPOSE, Options, Reader, is_transposed
+from oodd_logs.readers.cells import WIDEST
 from oodd_logs.readers.matrices import MatrixRows, episode_of, whole_number
 from oodd_logs.recording import Recording
 
-_BOUNDS: Final = Bounds(EPISODE.most, TrajectoryError, EPISODE.advice, kinds="fiubU")
+_BOUNDS: Final = Bounds(
+    EPISODE.most, TrajectoryError, EPISODE.advice, kinds="fiubU", entries=WIDEST
+)
 
 
 def _open(path: Path, options: Options) -> Iterator[Recording]:
@@ -20,11 +23,11 @@ def _open(path: Path, options: Options) -> Iterator[Recording]:
     arrays = {"observations": _array(path)} if path.suffix == ".npy" else read_npz(path, _BOUNDS)
     if is_transposed(path, options):
         arrays = {name: a.T if a.ndim == 2 else a for name, a in arrays.items()}
-    topic, fields = episode_of(cast("Mapping[str, MatrixRows]", arrays), str(path))
+    topic, fields, ledger = episode_of(cast("Mapping[str, MatrixRows]", arrays), str(path))
     for name in ("onset", "seed"):
         if name in fields:
             fields[name] = whole_number(str(path), name, fields[name])
-    yield Recording(path.stem, str(path), {"": topic}, fields)
+    yield Recording(path.stem, str(path), {"": topic}, fields, ledger)
 
 
 def _array(path: Path) -> Any:
