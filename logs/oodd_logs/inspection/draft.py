@@ -116,6 +116,9 @@ def draft(logs: Inspection, prefix: str = "", name: str = "") -> str:
 def _draft_rows(logs: Inspection) -> Iterator[str]:
     """Yield keys that say how rows become episodes."""
     times = logs.times
+    if logs.episode:
+        columns = logs.episode if len(logs.episode) > 1 else logs.episode[0]
+        yield f"episode = {toml(columns)}  # tells the episodes of a file apart"
     if len(times) == 1 and len(logs.topics) == 1:
         ((name, unit),) = times.items()
         suffix = "" if unit in {"date", "s"} or "[" in name else f"[{unit}]"

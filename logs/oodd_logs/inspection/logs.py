@@ -15,11 +15,14 @@ from oodd_eval.data.files import lies_in
 from oodd_eval.errors import TrajectoryError, UsageError
 from oodd_eval.names import check_known
 from oodd_logs.inspection.columns import FEW, ClockFacts, ColumnFacts, parse_dates, time_unit
+from oodd_logs.inspection.episode_keys import episode_columns
 from oodd_logs.ledger import Ledger
 from oodd_logs.readers import NO_OPTIONS, Options, Reader, in_order, readers
 from oodd_logs.recording import Column, Recording, Topic
+from oodd_logs.splitting import split_recording
 
 _CELLS: Final = 1 << 20  # of the rows that are in memory at once
+_TABLES: Final = 3  # recordings in which columns are looked for that tell episodes apart
 READ_ROWS: Final = 2_000_000
 """Rows of a topic that are looked at; of a longer one, blocks over all of it."""
 _FIRST: Final = 8  # columns of which the first row may count like a clock
@@ -95,6 +98,8 @@ class Inspection:
         Name of the format.
     options
         Options with which the files were read.
+    episode
+        Columns that tell the episodes of a file apart; none where a recording is one.
     recordings
         Facts of each recording, in the order of the files.
     columns
@@ -120,6 +125,7 @@ class Inspection:
     path: Path
     form: str
     options: dict[str, Any] = field(default_factory=dict)
+    episode: tuple[str, ...] = ()
     recordings: list[RecordingFacts] = field(default_factory=list)
     columns: dict[str, ColumnFacts] = field(default_factory=dict)
     transposed: list[str] = field(default_factory=list)
@@ -257,6 +263,7 @@ def inspect_logs(
     form: str = "",
     options: Options = NO_OPTIONS,
     progress: Callable[[str], None] = lambda _file: None,
+    episode: tuple[str, ...] = (),
 ) -> Inspection:
     """Look at a file, a folder of files, or the directory of a data set.
 
@@ -272,6 +279,8 @@ def inspect_logs(
         Options of reading, as in a recipe's ``[read]`` table.
     progress
         Called with the name of each file before it is read.
+    episode
+        Columns that tell episodes of a file apart; by default they are looked for.
 
     Returns
     -------
@@ -287,15 +296,25 @@ def inspect_logs(
     """
     reader, files, other_files = recognised(path, form)
     check_known(f"option of the format {reader.name}", reader.options, *options)
-    result = Inspection(path, reader.name, dict(options), others=other_files)
+    result = Inspection(path, reader.name, dict(options), episode=episode, others=other_files)
     names = {
         file: file.name if file == path else file.relative_to(path).as_posix() for file in files
     }
     later: list[tuple[Path, Recording]] = []
+    tables = 0
     for file in files:
         progress(names[file])
         try:
             for recording in reader.read(file, options):
+                tables += 1
+                if not result.episode and tables <= _TABLES:
+                    result.episode = episode_columns(recording)
+                    if result.episode and (result.recordings or later):
+                        return inspect_logs(path, form, options, progress, result.episode)
+                if result.episode:
+                    for part in split_recording(recording, result.episode, lenient=True):
+                        result.add(part, names[file])
+                    continue
                 columns = [n for topic in recording.topics.values() for n in topic.names]
                 # Those of a matrix, or of a text without a header, are numbered.
                 stems = {re.sub(r"\d+(\[.*\])?$", "", name) for name in columns}

@@ -278,7 +278,9 @@ def describe_logs(logs: Inspection, width: int = 80) -> str:
     lengths = [recording.length for recording in logs.recordings] or [0]
     heading = (
         f"{logs.path.name or logs.path}: {logs.form}, {counted(files, 'file(s)')}, "
-        f"{counted(len(logs.recordings), 'episode(s)')} of {min(lengths)}"
+        f"{counted(len(logs.recordings), 'episode(s)')} "
+        + (f"by {listed(logs.episode)} " if logs.episode else "")
+        + f"of {min(lengths)}"
     )
     if min(lengths) < max(lengths):
         heading += f" to {max(lengths)} rows, {np.median(lengths):g} in the median"

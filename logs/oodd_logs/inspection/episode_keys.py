@@ -1,0 +1,162 @@
+"""Columns that tell the episodes of a table apart, where nobody has said which they are.
+
+A key changes where a counter or the time starts anew, or has a name that says so; the numbers of
+robots that write in turn each have times that rise. Flags are known by their names.
+"""
+
+import re
+from collections.abc import Mapping
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oodd_logs.inspection.columns import parse_dates
+from oodd_logs.recording import Column, Recording, Topic
+from oodd_logs.splitting import BEGINS, COUNTS, ENDS, plain_name
+
+_CELLS: Final = 1 << 20  # that are looked at
+_SHORTEST: Final = 8  # rows of an episode, in the mean
+_STEADY: Final = 0.9  # share of rows in which a counter makes its usual step
+_IN_TURN: Final = 0.2  # share of rows whose stamp does not rise, where several robots write
+_EPISODE: Final = re.compile(
+    r"(?:^|[^a-z])(?:run|episode|ep|trial|traj|trajectory|rollout|demo|demonstration|experiment|lap"
+    r"|flight)(?:[^a-z]*(?:id|index|idx|no|nr|num|number|name))?$"
+)
+_NO_KEY: Final = re.compile(
+    r"anomal|fault|fail|label|health|attack|alarm|error|class|status|phase|stage|state|mode|signal"
+    r"|variable|channel|topic|metric|tag$|parameter|sensor|flag"
+)
+_STEP: Final = re.compile(r"(?:^|[^a-z])(?:step|timestep|frame|tick)s?(?:$|[^a-z])")
+
+_Mask = NDArray[np.bool_]
+
+
+def episode_columns(recording: Recording) -> tuple[str, ...]:
+    """Return the columns that tell episodes of a recording apart, none where it seems to be one.
+
+    Parameters
+    ----------
+    recording
+        What was recorded; with several topics it counts as one episode.
+    """
+    if len(recording.topics) != 1 or not recording.topics[""].names:
+        return ()
+    topic = recording.topics[""]
+    rows = min(topic.rows, max(1000, _CELLS // len(topic.names)))
+    sample = topic.read(topic.names, 0, rows)
+    counters = {n: x for n, cells in sample.items() if (x := _counter(cells)) is not None}
+    restarts = {n: np.diff(x) < 0 for n, x in counters.items() if _starts_anew(n, x)}
+    proposals = (
+        _keys(topic, sample, restarts),
+        _flags(topic),
+        _in_turn(sample, counters),
+        [n for n in restarts if _STEP.search(_words(n)) and not _NO_KEY.search(_words(n))][:1],
+    )
+    return tuple(next(filter(None, proposals), ()))
+
+
+def _words(name: str) -> str:
+    """Return a name in lower case, with a mark where it had a capital."""
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower()
+
+
+def _counter(cells: Column) -> NDArray[np.float64] | None:
+    """Return a column that may count rows or tell the time, dates in seconds."""
+    if cells.dtype.kind == "U":
+        dates = len(cells) > 1 and bool(cells[0]) and parse_dates(cells[:3]) is not None
+        return parse_dates(cells) if dates else None
+    return cells if len(cells) > 1 and not np.isnan(cells).any() else None
+
+
+def _starts_anew(name: str, counter: NDArray[np.float64]) -> bool:
+    """Tell whether a column rises, in even steps or as its name says, but for a few falls."""
+    steps = np.diff(counter)
+    rising = steps[steps > 0]
+    if not 1 <= (steps < 0).sum() <= len(steps) / _SHORTEST or len(rising) < _STEADY * (
+        len(steps) - (steps < 0).sum()
+    ):
+        return False
+    is_even = (np.abs(rising - np.median(rising)) <= 1e-3 * np.median(rising)).mean() >= _STEADY
+    return bool(is_even or COUNTS.search(_words(name)))
+
+
+def _keys(topic: Topic, sample: Mapping[str, Column], restarts: Mapping[str, _Mask]) -> list[str]:
+    """Return the likeliest key whose values follow one another, and another one that it needs."""
+    ranked: list[tuple[bool, bool, list[str]]] = []
+    for name, cells in sample.items():
+        says_so = bool(_EPISODE.search(_words(name)))
+        column = topic.read([name], 0, topic.rows)[name] if says_so else cells
+        changes = column[1:] != column[:-1]
+        episodes = int(changes.sum()) + 1
+        is_key = name not in restarts and not _NO_KEY.search(_words(name))
+        if not is_key or not 1 < episodes <= len(column) / _SHORTEST:
+            continue
+        explains = any(np.array_equal(falls, changes[: len(falls)]) for falls in restarts.values())
+        if not explains and not says_so:
+            continue
+        heads = np.append(0, np.flatnonzero(changes) + 1)
+        values = column[heads]
+        partner = [] if len({*values.tolist()}) == episodes else _partner(sample, name, changes)
+        if partner is not None and (explains or not partner):
+            ranked.append((not says_so, not _counts_up(values), [*partner, name]))
+    return min(ranked, key=lambda row: row[:2], default=(True, True, []))[2]
+
+
+def _counts_up(values: Column) -> bool:
+    return values.dtype.kind == "f" and bool((np.diff(values) == 1).all())
+
+
+def _partner(sample: Mapping[str, Column], name: str, changes: _Mask) -> list[str] | None:
+    """Return a column that makes the recurring values of a key unique; None without any."""
+    rows = np.append(0, np.flatnonzero(changes) + 1)
+    rows = rows[rows < len(sample[name])]
+    for other, cells in sample.items():
+        if (
+            other == name
+            or len(cells) <= rows[-1]
+            or ((cells[1:] != cells[:-1]) > changes[: len(cells) - 1]).any()
+        ):
+            continue
+        pairs = {*zip(cells[rows].tolist(), sample[name][rows].tolist(), strict=True)}
+        if len(pairs) == len(rows):
+            return [other]
+    return None
+
+
+def _flags(topic: Topic) -> list[str]:
+    """Return flags of last rows, else of first ones."""
+    for names in (ENDS, BEGINS):
+        columns = [name for name in topic.names if plain_name(name) in names]
+        cells = topic.read(columns, 0, topic.rows) if columns else {}
+        set_before_end = [n for n, x in cells.items() if _is_flag(x) and (x[1:-1] == 1).any()]
+        if set_before_end:
+            return [n for n, x in cells.items() if n in set_before_end or (_is_flag(x) and x.any())]
+    return []
+
+
+def _is_flag(cells: Column) -> bool:
+    """Tell whether cells are 0 but for single rows of 1."""
+    if cells.dtype.kind == "U" or not np.isin(cells, [0, 1]).all():
+        return False
+    flagged = cells == 1
+    return not (flagged[1:] & flagged[:-1]).any()
+
+
+def _in_turn(sample: Mapping[str, Column], counters: Mapping[str, Column]) -> list[str]:
+    """Return the column by whose values stamps rise that otherwise do not."""
+    for stamps in (x for n, x in counters.items() if COUNTS.search(_words(n))):
+        steps = np.diff(stamps)
+        if (steps <= 0).mean() < _IN_TURN:
+            continue
+        for name, cells in sample.items():
+            if _NO_KEY.search(_words(name)) or cells is stamps:
+                continue
+            values, codes = np.unique(cells, return_inverse=True)
+            if not 1 < len(values) <= len(cells) / _SHORTEST:
+                continue
+            order = np.argsort(codes, kind="stable")
+            same = np.diff(codes[order]) == 0
+            if (np.diff(stamps[order])[same] > 0).all():
+                return [name]
+    return []
