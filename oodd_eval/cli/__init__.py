@@ -285,11 +285,14 @@ def plain_path(text: str) -> Path:
 
 
 class _PathType(Converted):
-    """The type of a path, which shells complete as they do files; if `written`, of an output."""
+    """The type of a path, which shells complete as they do files; if `written`, of an output.
 
-    def __init__(self, metavar: str, *, written: bool = False) -> None:
+    Of a `partly_read` folder the command itself says which files no output may overwrite.
+    """
+
+    def __init__(self, metavar: str, *, written: bool = False, partly_read: bool = False) -> None:
         super().__init__(plain_path, metavar)
-        self.written = written
+        self.written, self.partly_read = written, partly_read
 
     def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> Items:
         return click.Path().shell_complete(ctx, param, incomplete)
@@ -303,6 +306,8 @@ def is_output(parameter: click.Parameter) -> bool:
 def _paths(parameter: click.Parameter, value: Any) -> Iterator[Path]:
     """Yield the paths that a command reads by an option or argument."""
     kind = parameter.type
+    if isinstance(kind, _PathType) and kind.partly_read:
+        return
     if isinstance(kind, _PathType | click.Path):
         yield from map(Path, value if isinstance(value, tuple) else (value,))
     elif isinstance(kind, Names) and "splits" in kind.kinds:
@@ -312,6 +317,7 @@ def _paths(parameter: click.Parameter, value: Any) -> Iterator[Path]:
 
 DIRECTORY: Final = _PathType("DIR")
 FILE: Final = _PathType("FILE")
+LOGS: Final = _PathType("FILE", partly_read=True)
 OUTPUT_DIRECTORY: Final = _PathType("DIR", written=True)
 OUTPUT_FILE: Final = _PathType("FILE", written=True)
 COUNT: Final = _named(click.IntRange(min=1), "N")
