@@ -1,52 +1,67 @@
-"""``oodd-eval scan``: which recorded episodes are odd, and which of their rows and sensors."""
+"""``oodd-eval scan``: which recorded episodes to look at first, and at which rows and sensors."""
 
 import json
-import math
+import shlex
 from collections.abc import Iterator, Sequence
-from itertools import product
-from typing import Final
+from contextlib import contextmanager
+from fnmatch import filter as fitting
+from pathlib import Path
+from typing import Any, Final
+from urllib.parse import quote
 
 import click
-import numpy as np
 from oodd_live.watchdog import Watchdog
+from rich.console import Console
 from rich.text import Text
 from tabulate import tabulate
 
-from oodd_eval.cli import COUNT, FILE, OUTPUT_FILE, PARAM, PARAMETER, Name, Options, command, refuse
+from oodd_eval.cli import (
+    COUNT,
+    FILE,
+    LOGS,
+    OUTPUT_FILE,
+    PARAM,
+    PARAMETER,
+    Name,
+    Options,
+    command,
+    refuse,
+)
 from oodd_eval.cli.console import make_console
-from oodd_eval.data.files import refuse_inputs, write_text
-from oodd_eval.names import counted
+from oodd_eval.data.files import read_text, refuse_inputs, write_text
+from oodd_eval.errors import UnknownNameError, UsageError
+from oodd_eval.names import counted, natural
 from oodd_eval.plugins.parameters import parameters_by_detector
 from oodd_eval.prose import print_prose
 from oodd_logs.commands.reader_plugins import register_formats
-from oodd_logs.episodes import files_of
-from oodd_logs.inspection.logs import refuse_logs
+from oodd_logs.episodes import Episode, files_of
+from oodd_logs.inspection.logs import recognised, refuse_logs
 from oodd_logs.recipe import Recipe
-from oodd_logs.scanning.logs import read_logs
-from oodd_logs.scanning.scan import SCANNER, Scan, scan_episodes
-from oodd_logs.scanning.scan_page import NUMBERS, cells, figure, page, summary, titles
-from oodd_logs.scanning.viewers import write_mcap, write_rerun
+from oodd_logs.scanning.logs import RecordedLogs, read_logs
+from oodd_logs.scanning.scan import SCANNER, Progress, Scan, ScannedEpisode, scan_episodes
+from oodd_logs.scanning.scan_page import NUMBERS, WORDS, page, summary, table_of
+from oodd_logs.scanning.viewers import foxglove_link, write_mcap, write_rerun
 
 _SHARE: Final = click.FloatRange(0, 1, min_open=True, max_open=True)
 _SHARE.name = "SHARE"
-_MANY: Final = 40  # episodes of which the table has a line each
-_LARGEST_SHARE: Final = 0.2  # of odd episodes, beyond which they hide one another
+_STYLES: Final = {"surely": "bold red", "look at": "yellow", "fine": ""}
+_NARROWEST: Final = 24  # columns of the terminal that a reason gets
+_OUTPUTS: Final = ("keep", "drop", "json", "html", "rerun", "mcap")
 _COLUMNS: Final = (
-    "largest: the episode's largest statistic; p: how often a nominal episode has one that is as "
-    "large; q: the smallest false discovery rate (--fdr) at which the episode is odd."
+    "p: how often a fine episode is as odd by chance; q: the smallest false discovery rate (--fdr) "
+    "at which the episode is odd."
 )
-_ALWAYS: Final = 5  # columns that are there in any case
-_NEXT: Final = 10  # of more, the nominal ones that it has beside the odd ones
 
 
 @command(
     "scan logs",
     "scan logs --html scan.html --json scan.json",
+    "scan logs --fine 'monday-*,run-07' --drop delete.txt",
     "scan logs --recipe arm.toml --detector pe --jobs 4",
     "scan today --recipe arm.toml --watchdog arm.npz --mcap scan.mcap",
     plugins=True,
 )
-@click.argument("logs", type=FILE)
+@click.argument("logs", type=LOGS)
 @click.option(
     "--recipe", type=FILE, help="how the logs are read (default: as `data inspect` has it)"
 )
@@ -55,6 +70,13 @@ _NEXT: Final = 10  # of more, the nominal ones that it has beside the odd ones
     "--read", multiple=True, type=PARAMETER, help="an option of the format; V is JSON or text"
 )
 @click.option("--window", type=COUNT, help="cut recordings into episodes of N rows")
+@click.option(
+    "--fine",
+    metavar="NAMES",
+    default="",
+    help="episodes that somebody confirmed: names, globs, or a file with a name a line",
+)
+@click.option("--first", default=10, type=COUNT, help="episodes that are listed in any case")
 @click.option("--detector", default=SCANNER, type=Name("detectors"), help="that judges")
 @click.option("--param", multiple=True, type=PARAMETER, help=PARAM)
 @click.option("--watchdog", type=FILE, help="a saved watchdog judges, and nothing is fitted")
@@ -62,123 +84,241 @@ _NEXT: Final = 10  # of more, the nominal ones that it has beside the odd ones
     "--fdr", default=0.1, type=_SHARE, help="share of nominal ones among those called odd, at most"
 )
 @click.option("--jobs", default=1, type=COUNT, help="fits at a time")
+@click.option("--keep", type=OUTPUT_FILE, help="write the names of recordings that are not odd")
+@click.option("--drop", type=OUTPUT_FILE, help="write the names of odd ones; a list for .json")
 @click.option("--json", type=OUTPUT_FILE, help="write everything as JSON")
-@click.option("--html", type=OUTPUT_FILE, help="write a page with a picture of each odd episode")
+@click.option("--html", type=OUTPUT_FILE, help="write a page with pictures of the first episodes")
 @click.option("--rerun", type=OUTPUT_FILE, help="write a recording for Rerun, .rrd (extra viewers)")
 @click.option(
     "--mcap", type=OUTPUT_FILE, help="write MCAP, for Foxglove and others (extra viewers)"
+)
+@click.option(
+    "--served", metavar="URL", help="of the MCAP file's folder, for links that open Foxglove"
 )
 def scan(options: Options) -> int:
     """Tell which recorded episodes are odd, and which of their rows and sensors.
 
     LOGS is a file, a folder of files, or the directory of a data set; with a recipe, the folder
-    that its files are relative to. Each episode is judged by a fit on the others, whatever labels
-    say. Most have to be nominal. The exit code is 1 when an episode is odd.
+    that its files are relative to. Each episode is judged by fits on the others, whatever labels
+    say; up to a fifth may be odd. The exit code is 1 when an episode is odd.
     """
     if options.watchdog:
         judges = "is for fits, and --watchdog judges without one: leave out one of them"
         refuse(options, ["detector", "param", "jobs"], judges)
     if options.recipe:
         refuse(options, ["format", "read"], "is said by the recipe: write it there")
+    if options.served and not options.served.startswith(("http://", "https://")):
+        raise UsageError(f"--served is {options.served!r}, expected an address with http or https")
     register_formats(options)
     recipe = Recipe.load(options.recipe) if options.recipe else None
     home = options.recipe.parent if options.recipe else None
-    form, read = options.format or "", dict(options.read)
-    outputs = [path for path in (options.json, options.html, options.rerun, options.mcap) if path]
-    for path, root in product(outputs, (options.logs, home)):
-        if recipe and root:
-            refuse_inputs(path, files_of(recipe, root))
-    refuse_logs(outputs, options.logs, recipe.format if recipe else form)
-    logs = read_logs(options.logs, recipe, form, read, options.window, home)
-    parameters = parameters_by_detector([options.detector], dict(options.param))
-    result = scan_episodes(
-        logs.episodes,
-        sensors=logs.sensors,
-        detector=options.detector,
-        watchdog=Watchdog.load(options.watchdog) if options.watchdog else None,
-        fdr=options.fdr,
-        baseline=logs.baseline,
-        parameters=parameters[options.detector],
-        jobs=options.jobs,
-    )
-    _print(result, logs.notes, options)
+    _check_outputs(options, recipe)
+    quiet = options.verbosity < 0
+    with _reporting(make_console(stderr=True, quiet=quiet)) as report:
+        report(f"reading {options.logs}", [])
+        form = options.format or ""
+        logs = read_logs(options.logs, recipe, form, dict(options.read), options.window, home)
+        parameters = parameters_by_detector([options.detector], dict(options.param))
+        result = scan_episodes(
+            logs.episodes,
+            sensors=logs.sensors,
+            detector=options.detector,
+            watchdog=Watchdog.load(options.watchdog) if options.watchdog else None,
+            fdr=options.fdr,
+            baseline=logs.baseline,
+            parameters=parameters[options.detector],
+            jobs=options.jobs,
+            fine=_confirmed(options.fine, [episode.name for episode in logs.episodes]),
+            first=options.first,
+            progress=report,
+            ledger=logs.ledger,
+        )
+    drop, keep = _lists(result)
+    console = make_console()
+    if not quiet:
+        _print_table(result, options, console)
+        _print_notes(result, logs, console)
+    console.print(Text(summary(result)))
+    for note, code in _next_steps(result, logs, drop, options) if not quiet else ():
+        print_prose(note, console)
+        if code:
+            console.print(Text(f"  {code}"))
+    for file, names in ((options.keep, keep), (options.drop, drop)):
+        if file:
+            write_text(file, _listed(names, as_json=file.suffix == ".json"))
     if options.json:
         write_text(options.json, json.dumps(result.as_json(), indent=1, allow_nan=False) + "\n")
     if options.html:
-        write_text(options.html, page(result, options.logs.resolve().name))
+        title = options.logs.resolve().name
+        link = _link(logs, options)
+        write_text(
+            options.html, page(result, title, first=options.first, link=link, notes=logs.notes)
+        )
     if options.rerun:
-        write_rerun(result, options.rerun)
+        write_rerun(result, options.rerun, options.first)
     if options.mcap:
         write_mcap(result, options.mcap)
     return int(bool(result.odd))
 
 
-def _print(result: Scan, notes: Sequence[str], options: Options) -> None:
-    console = make_console()
-    if options.verbosity >= 0:
-        # The oddest first: of many, odd ones and the next to these.
-        listed = sorted(
-            result.episodes,
-            key=lambda scanned: (
-                not scanned.odd,
-                math.inf if math.isnan(scanned.p) else scanned.p,
-                -scanned.largest,
-            ),
+def _check_outputs(options: Options, recipe: Recipe | None) -> None:
+    """Raise `UsageError` for an output that is one of the files that are read."""
+    outputs = {name: path for name in _OUTPUTS if (path := getattr(options, name))}
+    if not outputs:
+        return
+    form = recipe.format if recipe else options.format or ""
+    inputs = [*recognised(options.logs, form)[1]]
+    inputs += [Path(options.fine)] if Path(options.fine).is_file() else []
+    for root in filter(None, (options.logs, options.recipe and options.recipe.parent)):
+        inputs += files_of(recipe, root) if recipe else ()
+    for name, path in outputs.items():
+        refuse_inputs(path, inputs, f"--{name}")
+    refuse_logs(outputs.values(), options.logs, form)
+
+
+@contextmanager
+def _reporting(console: Console) -> Iterator[Progress]:
+    """Show what is done on a terminal, and everywhere the first verdicts as soon as there are."""
+    with console.status("", spinner="line") as status:
+        verdicts: list[str] = []
+
+        def report(done: str, names: Sequence[str]) -> None:
+            status.update(done)
+            if names and not verdicts:
+                verdicts.extend(names[:5])
+                console.print(f"First verdicts, the oddest first: {', '.join(verdicts)}")
+
+        yield report
+
+
+def _confirmed(text: str, names: Sequence[str]) -> list[str]:
+    """Return the names of episodes that somebody confirmed, of all pieces of a recording."""
+    is_file = text not in names and Path(text).is_file()
+    patterns = read_text(Path(text)).splitlines() if is_file else text.split(",")
+    confirmed: dict[str, None] = {}
+    for pattern in filter(None, map(str.strip, patterns)):
+        pieces = [name for name in names if name == pattern or name.startswith(f"{pattern}#")]
+        selected = pieces or fitting(names, pattern)
+        if not selected:
+            raise UnknownNameError("episode", pattern, names)
+        confirmed.update(dict.fromkeys(selected))
+    return [*confirmed]
+
+
+def _lists(result: Scan) -> tuple[list[str], list[str]]:
+    """Return the names of recordings with an odd piece, and of the others, in recorded order."""
+    odd = {_recording(scanned.episode) for scanned in result.odd}
+    names = dict.fromkeys(_recording(scanned.episode) for scanned in result.episodes)
+    return [name for name in names if name in odd], [name for name in names if name not in odd]
+
+
+def _recording(episode: Episode) -> str:
+    """Return the name of the recording that an episode is a piece of."""
+    name, _, number = episode.name.rpartition("#")
+    return name if name and number.isdigit() else episode.name
+
+
+def _listed(names: Sequence[str], *, as_json: bool) -> str:
+    """Return a name a line or, as JSON, a list, of numbers where data sets number episodes."""
+    if not as_json:
+        return "".join(f"{name}\n" for name in names)
+    numbers = [_number(name) for name in names]
+    return json.dumps(names if min(numbers, default=0) < 0 else numbers) + "\n"
+
+
+def _number(name: str) -> int:
+    """Return the number of ``episode_000012``; -1 for other names."""
+    return natural(name.removeprefix("episode_")) if name.startswith("episode_") else -1
+
+
+def _print_table(result: Scan, options: Options, console: Console) -> None:
+    """Print the first episodes and all that are not fine, with -v all, a line each."""
+    listed = [
+        scanned
+        for scanned in result.ranked
+        if scanned.place <= options.first or scanned.band != "fine" or options.verbosity > 0
+    ]
+    titles, rows = table_of(listed)
+    marks = [WORDS[scanned.band] for scanned in listed]
+    # Names may have line breaks.
+    cells = [[mark, *(" ".join(cell.split()) for cell in row)]
+             for mark, row in zip(marks, rows, strict=True)]  # fmt: skip
+    head = ["", *titles]
+    align = ["right" if title in NUMBERS else "left" for title in head]
+    widths: list[int | None] = [None] * len(head)
+    if "reason" in head:
+        others = [i for i, title in enumerate(head) if title != "reason"]
+        taken = sum(2 + max(len(row[i]) for row in [head, *cells]) for i in others)
+        widths[head.index("reason")] = max(_NARROWEST, console.width - taken)
+    table = tabulate(
+        cells, head, "simple", disable_numparse=True, colalign=align, maxcolwidths=widths
+    )
+    style = ""
+    bands = iter(listed)
+    for number, line in enumerate(table.splitlines()):
+        if number > 1 and not line.startswith(" "):
+            style = _STYLES[next(bands).band]
+        console.print(Text(line.rstrip(), style))
+    console.print("")
+    if left := len(result.episodes) - len(listed):
+        print_prose(f"Not listed: {counted(left, 'less odd episode(s)')} (-v lists all).", console)
+    if "p" in titles:
+        print_prose(_COLUMNS, console)
+
+
+def _print_notes(result: Scan, logs: RecordedLogs, console: Console) -> None:
+    """Print what became of the logs, how they were judged, and what labels say."""
+    for note in (*logs.notes, *result.notes):
+        print_prose(note, console)
+    if labelled := [scanned for scanned in result.ranked if scanned.label]:
+        anomalous = counted(len(labelled), "episode(s)")
+        odd = sum(scanned.odd for scanned in labelled)
+        places = ", ".join(str(scanned.place) for scanned in labelled[:20])
+        print_prose(
+            f"Anomalous by their labels: {anomalous}, {odd} of them odd here; their places are "
+            f"{places}{', ...' * (len(labelled) > 20)}.",
+            console,
         )
-        if options.verbosity == 0 and len(listed) > _MANY:
-            listed = listed[: len(result.odd) + _NEXT]
-        heads = titles(listed)
-        # Names may have line breaks.
-        lines = [
-            [" ".join(cell.split()) for cell in cells(scanned, brief=True)[: len(heads)]]
-            for scanned in listed
-        ]
-        kept = [i for i in range(len(heads)) if i < _ALWAYS or any(line[i] for line in lines)]
-        align = ["left", *("right" if heads[i] in NUMBERS else "left" for i in kept)]
-        marks = ["odd" * scanned.odd for scanned in listed]
-        rows = [[mark, *(line[i] for i in kept)] for mark, line in zip(marks, lines, strict=True)]
-        head = ["", *(heads[i] for i in kept)]
-        table = tabulate(rows, head, "simple", disable_numparse=True, colalign=align)
-        colours = ["", "", *("bold red" * scanned.odd for scanned in listed)]
-        for line, colour in zip(table.splitlines(), colours, strict=True):
-            console.print(Text(line.rstrip(), colour))
-        console.print("")
-        left = len(result.episodes) - len(listed)
-        unlisted = f"Not listed: {counted(left, 'less odd episode(s)')} (-v lists all)."
-        remarks = [*notes, *result.notes, *_on_labels(result, fitted=not options.watchdog)]
-        for note in (_COLUMNS, *([unlisted] * (left > 0)), *remarks):
-            print_prose(note, console)
-    console.print(Text(summary(result)))
-    if result.odd and not options.html and options.verbosity >= 0:
-        console.print(Text("--html FILE writes a page with a picture of each odd episode."))
 
 
-def _on_labels(result: Scan, *, fitted: bool) -> Iterator[str]:
-    """Yield what became of episodes that the logs call anomalous, and whether they are many."""
-    labelled = [scanned for scanned in result.episodes if scanned.label]
-    if not labelled:
+def _next_steps(
+    result: Scan, logs: RecordedLogs, drop: Sequence[str], options: Options
+) -> Iterator[tuple[str, str]]:
+    """Yield what a person would do next, a sentence each, with a command or an address."""
+    suspicious = [scanned for scanned in result.ranked if scanned.band != "fine"]
+    if not suspicious:
         return
-    missed = [scanned for scanned in labelled if not scanned.odd]
-    anomalous = counted(len(labelled), "episode(s)")
+    first = suspicious[0]
+    at = "" if first.first is None else f" from row {first.first}"
+    sensors = f" ({', '.join(first.suspects[:3])})" if first.suspects else ""
+    drawn = "" if options.html else "; --html FILE draws it"
+    yield f"Next: look at {first.episode.name}{at}{sensors}{drawn}.", _link(logs, options)(first)
+    if options.rerun:
+        yield "Rerun opens a tab for each of the first:", shlex.join(["rerun", str(options.rerun)])
+    unsure = [s.episode.name for s in suspicious if not s.odd] or [first.episode.name]
     yield (
-        f"Anomalous by their labels: {anomalous}, {len(labelled) - len(missed)} of them odd here."
+        "Episodes that turn out to be fine make the others' ranks exact, from 20 on:",
+        f"--fine {shlex.quote(','.join(unsure[:3]))}",
     )
-    largest_unlabelled = [scanned.largest for scanned in result.episodes if not scanned.label]
-    limits = [scanned.threshold for scanned in missed if math.isfinite(scanned.threshold)]
-    if not (fitted and limits and largest_unlabelled):
-        return
-    usual = np.median(largest_unlabelled)
-    anomalies = np.median([scanned.largest for scanned in labelled])
-    yield (
-        f"The largest statistic of these is {figure(anomalies)} in the median, that of the others "
-        f"{figure(usual)}; an episode is odd from about {figure(np.median(limits))} on, as a scan "
-        "does not know which episodes are nominal."
-    )
-    many = len(labelled) > len(result.episodes) * _LARGEST_SHARE
-    yield (
-        "Where more than a fifth are anomalous, they pass for nominal: scan nominal logs alone, or "
-        "judge by a watchdog that was fitted on these (--watchdog FILE)."
-        if many
-        else "A detector that is fitted on nominal episodes alone finds smaller faults: use "
-        "`oodd-eval data import` and `run`, or a watchdog (--watchdog FILE)."
-    )
+    if drop and logs.form == "lerobot":
+        indices = shlex.quote(json.dumps([_number(name) for name in drop]))
+        root = f"--root {shlex.quote(str(options.logs))} --repo_id NAME --new_repo_id NEW"
+        operation = f"--operation.type delete_episodes --operation.episode_indices {indices}"
+        yield "Delete the odd ones, into a new one:", f"lerobot-edit-dataset {root} {operation}"
+    elif drop and not options.drop:
+        yield "--drop FILE writes the names of the odd ones, --keep FILE those of the others.", ""
+
+
+def _link(logs: RecordedLogs, options: Options) -> Any:
+    """Return a function of an episode: its link to Foxglove, empty where nothing is served."""
+
+    def link(scanned: ScannedEpisode) -> str:
+        if not options.served:
+            return ""
+        file = options.mcap.name if options.mcap else ""
+        if not file and logs.form == "mcap":
+            root = options.logs if options.logs.is_dir() else options.logs.parent
+            file = Path(scanned.episode.source).relative_to(root).as_posix()
+        return foxglove_link(scanned, f"{options.served.rstrip('/')}/{quote(file)}") if file else ""
+
+    return link

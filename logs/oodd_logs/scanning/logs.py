@@ -28,6 +28,8 @@ class RecordedLogs:
         Names, units and roles of the columns.
     baseline
         Rows at the start of every episode that are nominal.
+    form
+        Name of their format.
     ledger
         What was left out, held or changed.
     notes
@@ -37,6 +39,7 @@ class RecordedLogs:
     episodes: list[Episode]
     sensors: list[Quantity]
     baseline: int
+    form: str
     ledger: Ledger
     notes: list[str]
 
@@ -93,6 +96,7 @@ def read_logs(
             list(source.episodes(EVERY)),
             [*source.sensors],
             recipe.baseline,
+            reader.name,
             ledger,
             ledger.summary([q.name for q in source.sensors], source.recordings),
         )

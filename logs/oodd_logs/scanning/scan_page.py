@@ -1,4 +1,4 @@
-"""A scan as one page of HTML: every episode in a table, a picture of each odd one.
+"""A scan as one page of HTML: ranked episodes in bands, with pictures of their suspects.
 
 The page needs nothing else: no scripts, fonts or pictures of other files, and it is dark where its
 reader's system is.
@@ -6,7 +6,7 @@ reader's system is.
 
 import html
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Final
 
 import numpy as np
@@ -17,55 +17,65 @@ from oodd_logs.marks import runs_of
 from oodd_logs.scanning.scan import Scan, ScannedEpisode
 
 Floats = NDArray[np.float64]
+Link = Callable[[ScannedEpisode], str]
 
 PICTURES: Final = 100
-"""Odd episodes that have a picture: of more, the first ones."""
+"""Most episodes that have a picture."""
 SENSORS: Final = 3
-AROUND: Final = 100
-"""Rows before and after the first odd row in which sensors are drawn."""
+"""Suspects of an episode that are drawn and listed."""
+AROUND: Final = 250
+"""Rows before and after the first odd row in which sensors of longer episodes are drawn."""
 POINTS: Final = 600
 """Columns of a curve: of more rows, the smallest and the largest value of each column are drawn."""
-LOGARITHMIC: Final = 20.0
-"""Multiple of the threshold from which on a statistic is drawn on a logarithmic scale."""
+NUMBERS: Final = ("row", "time", "p", "q")
+TITLES: Final = ("episode", *NUMBERS, "sensors", "reason", "label in the logs")
+WORDS: Final = {"surely": "odd", "look at": "look", "fine": "fine"}
+"""A word for each band, with which its lines begin."""
 
-NUMBERS: Final = ("rows", "largest", "p", "q", "first odd row")
-TITLES: Final = ("episode", *NUMBERS, "look at", "faults", "label in the logs")
-
-_LEFT, _RIGHT, _WIDTH = 76, 12, 860
-_TALL, _LOW, _GAP = 150, 84, 44
-
+_HEADINGS: Final = {"surely": "Odd", "look at": "To look at", "fine": "The next ones, fine"}
+_FEWEST: Final = 5  # other episodes with a usual range
+_USUAL: Final = (5, 95)  # per cent of their values
+_LEFT, _RIGHT, _WIDTH, _HEIGHT, _GAP = 76, 12, 860, 100, 44
 _LEGEND: Final = (
-    "In the pictures the line is the first odd row, shaded are rows with a statistic above the "
-    "threshold; sensors are drawn around the first odd row."
+    "In the pictures the vertical line is the odd row, the band holds the middle nine tenths of "
+    "the other episodes at the same row, and shaded are rows with a statistic above the threshold."
 )
-
 _STYLE: Final = """
 :root { color-scheme: light dark; --text: #1b1f24; --dim: #5a6472; --ground: #fff; --line: #d9dee5;
-  --curve: #0b62a8; --odd: #b3261e; --shade: #b3261e22; --mark: #fdecea; }
+  --curve: #0b62a8; --odd: #b3261e; --look: #8a5a00; --shade: #b3261e22; --usual: #5a647230; }
 @media (prefers-color-scheme: dark) { :root { --text: #e6e9ee; --dim: #9aa5b3; --ground: #15181c;
-  --line: #343b45; --curve: #6db3f2; --odd: #ff8a80; --shade: #ff8a8026; --mark: #3a2321; } }
+  --line: #343b45; --curve: #6db3f2; --odd: #ff8a80; --look: #f2b84b; --shade: #ff8a8026;
+  --usual: #9aa5b338; } }
 * { box-sizing: border-box; }
 body { margin: 0 auto; padding: 1.5rem 1rem 4rem; max-width: 60rem; color: var(--text);
-  background: var(--ground); font: 15px/1.5 system-ui, sans-serif; }
-h1 { font-size: 1.5rem; margin: 0 0 .5rem; } h2 { font-size: 1.1rem; margin: 2.2rem 0 .3rem;
-  overflow-wrap: anywhere; }
-p { margin: .3rem 0; } .dim { color: var(--dim); } a { color: var(--curve); }
-.wide { overflow-x: auto; margin-top: 1rem; }
+  background: var(--ground); font: 15px/1.5 system-ui, sans-serif; overflow-wrap: anywhere; }
+h1 { font-size: 1.5rem; margin: 0 0 .5rem; } h2 { font-size: 1.2rem; margin: 2.2rem 0 .3rem; }
+h3 { font-size: 1rem; margin: 1.4rem 0 .2rem; } p { margin: .3rem 0; }
+.dim { color: var(--dim); } a { color: var(--curve); }
+.wide { overflow-x: auto; margin-top: .6rem; }
 table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; }
 th, td { padding: .25rem .6rem; text-align: left; border-bottom: 1px solid var(--line);
   vertical-align: top; white-space: nowrap; }
 td.words { white-space: normal; min-width: 9rem; } th { color: var(--dim); font-weight: 600; }
-.number { text-align: right; } tr.odd { background: var(--mark); }
-tr.odd td:first-child { box-shadow: inset 3px 0 var(--odd); }
+.number { text-align: right; } .odd { color: var(--odd); } .look { color: var(--look); }
+td.odd, td.look { font-weight: 600; }
 svg { display: block; width: 100%; min-width: 36rem; height: auto; }
 svg text { fill: var(--dim); font: 12px system-ui, sans-serif; } svg .name { fill: var(--text); }
 svg .frame { fill: none; stroke: var(--line); } svg .shade { fill: var(--shade); }
+svg .usual { fill: var(--usual); } svg .first { stroke: var(--odd); }
 svg .curve { fill: none; stroke: var(--curve); stroke-width: 1.3; stroke-linejoin: round; }
-svg .limit { stroke: var(--odd); stroke-dasharray: 5 4; } svg .first { stroke: var(--odd); }
+svg .limit { stroke: var(--odd); stroke-dasharray: 5 4; }
 """
 
 
-def page(scan: Scan, title: str = "Scan") -> str:
+def page(
+    scan: Scan,
+    title: str = "Scan",
+    *,
+    first: int = 10,
+    link: Link = lambda _: "",
+    notes: Sequence[str] = (),
+) -> str:
     """Return a scan as HTML.
 
     Parameters
@@ -74,177 +84,202 @@ def page(scan: Scan, title: str = "Scan") -> str:
         What to show.
     title
         Heading of the page, such as the name of the logs.
+    first
+        Number of episodes that have a picture whatever their band.
+    link
+        Returns the address that opens an episode in a viewer; empty where there is none.
+    notes
+        Sentences about the logs, besides those of the scan.
 
     Returns
     -------
     str
         A whole document.
     """
-    heading, odd = html.escape(title), [i for i, scanned in enumerate(scan.episodes) if scanned.odd]
+    heading = html.escape(title)
+    shown = [s for s in scan.ranked if s.place <= first or s.band != "fine"]
     head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width">'
     text = [
         f'<!doctype html><html lang="en"><head>{head}<title>{heading}</title>',
         f"<style>{_STYLE}</style></head><body><h1>{heading}</h1>",
         f"<p><strong>{summary(scan)}</strong> Judged by {html.escape(scan.judge)}.</p>",
-        *(f'<p class="dim">{html.escape(note)}</p>' for note in scan.notes),
-        *([f'<p class="dim">{_LEGEND}</p>'] if odd else []),
+        *(f'<p class="dim">{html.escape(remark)}</p>' for remark in (*notes, *scan.notes)),
+        f'<p class="dim">{_LEGEND}</p>',
     ]
-    for i in odd[:PICTURES]:
-        scanned = scan.episodes[i]
-        about = html.escape(describe(scanned))
-        if scanned.label:
-            about += f' <span class="dim">The logs say: {html.escape(scanned.label)}.</span>'
-        text.append(
-            f'<h2 id="episode-{i}">{html.escape(scanned.episode.name)}</h2><p>{about}</p>'
-            f'<div class="wide">{picture(scanned, scan.sensors)}</div>'
-        )
-    if len(odd) > PICTURES:
-        text.append(f"<p>And {len(odd) - PICTURES} more odd episodes without a picture.</p>")
-    text.append(f"<h2>All episodes</h2>{_table(scan.episodes)}")
+    drawn = shown[:PICTURES]
+    for band, name in _HEADINGS.items():
+        in_band = [scanned for scanned in drawn if scanned.band == band]
+        text += [f'<h2 class="{WORDS[band]}">{name}</h2>'] * bool(in_band)
+        text += [_article(scanned, scan, link(scanned)) for scanned in in_band]
+    if len(shown) > PICTURES:
+        text.append(f"<p>And {len(shown) - PICTURES} more without a picture.</p>")
+    text.append(f"<h2>All episodes</h2>{_table(scan, {scanned.place for scanned in drawn})}")
     return "\n".join([*text, "</body></html>\n"])
 
 
-def _table(episodes: Sequence[ScannedEpisode]) -> str:
-    names = titles(episodes)
-    lines = ["".join(f"<th{' class=number' * (name in NUMBERS)}>{name}</th>" for name in names)]
-    for i, scanned in enumerate(episodes):
-        name, *texts = map(html.escape, cells(scanned))
-        line = f'<td><a href="#episode-{i}">{name}</a></td>' if scanned.odd else f"<td>{name}</td>"
-        for title, text in zip(names[1:], texts, strict=False):
-            line += f"<td class={'number' if title in NUMBERS else 'words'}>{text}</td>"
-        lines.append(line)
-    odd = [False, *(scanned.odd for scanned in episodes)]
-    rows = [f"<tr{' class=odd' * o}>{line}</tr>" for o, line in zip(odd, lines, strict=True)]
-    return f'<div class="wide"><table>{chr(10).join(rows)}</table></div>'
+def _article(scanned: ScannedEpisode, scan: Scan, address: str) -> str:
+    sentences = [f"{scanned.reason}."] if scanned.reason else []
+    if not math.isnan(scanned.p):
+        sentences.append(f"p {p_value(scanned.p)}, q {p_value(scanned.q)}.")
+    sentences += [f"The logs say: {scanned.label}."] if scanned.label else []
+    about = html.escape(" ".join(sentences))
+    if address:
+        row = "" if scanned.first is None else f" at row {scanned.first}"
+        about += f' <a href="{html.escape(address)}">Open in Foxglove{row}</a>'
+    name = html.escape(scanned.episode.name)
+    return (
+        f'<h3 id="episode-{scanned.place}">{scanned.place}. {name}</h3><p>{about}</p>'
+        f'<div class="wide">{picture(scanned, scan)}</div>'
+    )
 
 
-def titles(episodes: Sequence[ScannedEpisode]) -> tuple[str, ...]:
-    """Return the titles of `cells`; the last one, of labels, where any episode has one."""
-    return TITLES if any(scanned.label for scanned in episodes) else TITLES[:-1]
+def _table(scan: Scan, drawn: set[int]) -> str:
+    titles, rows = table_of(scan.ranked)
+    lines = ["<th></th>" + "".join(f"<th{_class(title)}>{title}</th>" for title in titles)]
+    for scanned, texts in zip(scan.ranked, rows, strict=True):
+        name, *others = [
+            f"<td{_class(title)}>{html.escape(text)}</td>"
+            for title, text in zip(titles, texts, strict=True)
+        ]
+        if scanned.place in drawn:
+            link = f'<a href="#episode-{scanned.place}">{html.escape(scanned.episode.name)}</a>'
+            name = f"<td>{link}</td>"
+        word = WORDS[scanned.band]
+        lines.append(f"<td class={word}>{word}</td>{name}{''.join(others)}")
+    body = "\n".join(f"<tr>{line}</tr>" for line in lines)
+    return f'<div class="wide"><table>{body}</table></div>'
 
 
-def cells(one: ScannedEpisode, *, brief: bool = False) -> list[str]:
-    """Return an episode as texts in the order of `TITLES`; if brief, what is most important."""
-    suspects = one.suspects[:SENSORS] if brief else one.suspects
-    faults = dict.fromkeys(fault.fault if brief else str(fault) for fault in one.faults)
-    return [
-        one.episode.name,
-        str(len(one.scores)),
-        figure(one.largest),
-        p_value(one.p),
-        p_value(one.q),
-        "" if one.first is None else str(one.first),
-        ", ".join(suspects) if one.odd else "",
-        ", ".join(faults),
-        one.label,
+def _class(title: str) -> str:
+    return " class=number" * (title in NUMBERS) or " class=words" * (title != "episode")
+
+
+def table_of(episodes: Sequence[ScannedEpisode]) -> tuple[list[str], list[list[str]]]:
+    """Return titles and cells of a table of episodes, without columns that are empty."""
+    rows = [
+        [
+            scanned.episode.name,
+            "" if scanned.first is None else str(scanned.first),
+            "" if (time := scanned.as_json()["first_odd_time"]) is None else f"{time:.10g}",
+            p_value(scanned.p),
+            p_value(scanned.q),
+            ", ".join(scanned.suspects[:SENSORS]),
+            scanned.reason,
+            scanned.label,
+        ]
+        for scanned in episodes
     ]
+    kept = [i for i in range(len(TITLES)) if any(row[i] for row in rows)]
+    return [TITLES[i] for i in kept], [[row[i] for i in kept] for row in rows]
 
 
 def summary(scan: Scan) -> str:
-    """Return how many episodes are odd, in a sentence."""
-    rate = f"false discovery rate {scan.fdr:g}"
-    episodes = counted(len(scan.episodes), "episode(s)")
-    verb = "is" if 1 in (len(scan.odd), len(scan.episodes)) else "are"
-    return f"{len(scan.odd)} of {episodes} {verb} odd ({rate})."
+    """Return how many episodes are in each band, in a sentence."""
+    bands = [scanned.band for scanned in scan.episodes]
+    verb = "is" if 1 in (len(scan.odd), len(bands)) else "are"
+    return (
+        f"{len(scan.odd)} of {counted(len(bands), 'episode(s)')} {verb} odd (false discovery rate "
+        f"{scan.fdr:g}); {bands.count('look at')} to look at; {bands.count('fine')} fine."
+    )
 
 
-def describe(one: ScannedEpisode) -> str:
-    """Return what is odd about an episode, in a sentence or two."""
-    parts = []
-    if one.since is not None and one.row is not None:
-        parts.append(
-            f"Statistic above its threshold from row {one.row} on, beginning at row {one.since}; "
-            f"p = {p_value(one.p)}, q = {p_value(one.q)}."
+def picture(scanned: ScannedEpisode, scan: Scan) -> str:
+    """Return the suspects beside the other episodes, and a statistic that exceeds its threshold."""
+    rows, first = len(scanned.scores), scanned.first
+    span = range(rows)
+    if first is not None and rows > 2 * AROUND:
+        span = range(max(0, first - AROUND), min(rows, first + AROUND + 1))
+    columns = {name: d for d, name in enumerate(scan.sensors)}
+    names = [name for name in [*scanned.suspects, *scanned.sensors, *columns] if name in columns]
+    panels: list[str] = []
+    for name in list(dict.fromkeys(names))[: min(SENSORS, max(1, len(scanned.suspects)))]:
+        values = [other.episode.observations[:, columns[name]] for other in scan.episodes
+                  if other is not scanned]  # fmt: skip
+        own = scanned.episode.observations[:, columns[name]]
+        panels.append(_panel(len(panels), own, name, span, scanned, usual=_usual(values, span)))
+    if scanned.intervals:
+        statistic = np.where(np.isfinite(scanned.statistic), scanned.statistic, np.nan)
+        panels.append(
+            _panel(len(panels), statistic, "statistic", span, scanned, limit=scanned.threshold)
         )
-        shares = [f"{name} {share:.0%}" for name, share in list(one.sensors.items())[:SENSORS]]
-        parts.append(f"Evidence: {', '.join(shares)}.")
-    if one.faults:
-        parts.append(f"Faults of the stream: {', '.join(map(str, one.faults))}.")
-    return " ".join(parts)
-
-
-def picture(one: ScannedEpisode, names: Sequence[str]) -> str:
-    """Return the statistic with its threshold, and suspected sensors around the first odd row."""
-    columns = {name: one.episode.observations[:, d] for d, name in enumerate(names)}
-    suspects = [name for name in [*one.suspects, *one.sensors, *names] if name in columns]
-    first, rows = one.first or 0, len(one.scores)
-    around = range(max(0, first - AROUND), min(rows, first + AROUND + 1))
-    statistic = np.where(np.isfinite(one.statistic), one.statistic, np.nan)
-    title, limit = "statistic", one.threshold
-    logarithmic = 0 < limit * LOGARITHMIC < one.largest < math.inf
-    if logarithmic:
-        statistic = np.log10(np.maximum(statistic, limit / 1e3))
-        title, limit = "statistic (log)", math.log10(limit)
-    panels = [_panel(statistic, title, 0, _TALL, range(rows), one, limit, logarithmic=logarithmic)]
-    height = _TALL + _GAP
-    for name in list(dict.fromkeys(suspects))[:SENSORS]:
-        panels.append(_panel(columns[name], name, height, _LOW, around, one))
-        height += _LOW + _GAP
-    label = html.escape(f"Statistic and sensors of {one.episode.name}")
-    box = f'viewBox="0 0 {_WIDTH} {height}"'
+    label = html.escape(f"Suspects of {scanned.episode.name}")
+    box = f'viewBox="0 0 {_WIDTH} {len(panels) * (_HEIGHT + _GAP)}"'
     return f'<svg {box} role="img" aria-label="{label}">{"".join(panels)}</svg>'
 
 
-def _tag(name: str, content: str | None = None, **attributes: str | float) -> str:
-    """Return an element; numbers with a point get one decimal."""
-    tag = f"<{name}"
-    for key, value in attributes.items():
-        text = f"{value:.1f}" if isinstance(value, float) else value
-        tag += f' {key.strip("_").replace("_", "-")}="{text}"'
-    return tag + ("/>" if content is None else f">{content}</{name}>")
+def _usual(values: Sequence[Floats], span: range) -> Floats:
+    """Return a low and a high value of the other episodes for each row, NaN where they are few."""
+    rows = np.full((len(values), len(span)), np.nan)
+    for row, column in zip(rows, values, strict=True):
+        part = column[span.start : span.stop]
+        row[: len(part)] = part
+    usual = np.full((2, len(span)), np.nan)
+    enough = np.isfinite(rows).sum(axis=0) >= _FEWEST
+    usual[:, enough] = np.nanpercentile(rows[:, enough], _USUAL, axis=0)
+    return usual
 
 
 def _panel(
+    number: int,
     values: Floats,
     name: str,
-    top: int,
-    height: int,
-    rows: range,
+    span: range,
     scanned: ScannedEpisode,
-    limit: float = math.nan,
     *,
-    logarithmic: bool = False,
+    usual: Floats | None = None,
+    limit: float = math.nan,
 ) -> str:
-    """Return a curve of some rows in its frame, with limit and odd rows."""
-    top, begin, end = top + 18, rows.start, rows.stop
-    visible, is_limited = values[begin:end], math.isfinite(limit)
-    finite = np.append(visible[np.isfinite(visible)], limit if is_limited else [])
-    low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 1.0)
+    """Return a curve of some rows in its frame, with what is usual, a limit and odd rows."""
+    top, begin, end = 18 + number * (_HEIGHT + _GAP), span.start, span.stop
+    bottom, right = top + _HEIGHT, _WIDTH - _RIGHT
+    visible, band = values[begin:end], np.empty((2, 0)) if usual is None else usual
+    drawn = np.concatenate([visible, band.ravel(), [limit]])
+    drawn = drawn[np.isfinite(drawn)]
+    low, high = (float(drawn.min()), float(drawn.max())) if len(drawn) else (0.0, 1.0)
     if low == high:
         low, high = low - 1, high + 1
-    width, right, bottom = _WIDTH - _LEFT - _RIGHT, _WIDTH - _RIGHT, top + height
 
     def x(row: float) -> float:
-        return _LEFT + width * (row - begin) / max(1, end - begin - 1)
+        return _LEFT + (right - _LEFT) * (row - begin) / max(1, end - begin - 1)
 
     def y(value: float) -> float:
-        return bottom - 4 - (height - 8) * (value - low) / (high - low)
+        return bottom - 4 - (_HEIGHT - 8) * (value - low) / (high - low)
 
-    def text(at: float, line: float, content: str, anchor: str = "end") -> str:
-        return _tag("text", content, x=at, y=line, text_anchor=anchor)
+    def points(curve: Floats, start: int, stop: int) -> list[str]:
+        return [f"{x(begin + r):.1f},{y(v):.1f}" for r, v in _thinned(curve, start, stop)]
+
+    def text(at: float, line: float, content: str, more: str = 'text-anchor="end"') -> str:
+        return f'<text x="{at}" y="{line}" {more}>{html.escape(content)}</text>'
+
+    def line(kind: str, x1: float, y1: float, x2: float, y2: float) -> str:
+        return f'<line class="{kind}" x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}"/>'
+
+    def box(kind: str, start: float, stop: float) -> str:
+        size = f'width="{max(1.0, stop - start):.1f}" height="{_HEIGHT}"'
+        return f'<rect class="{kind}" x="{start:.1f}" y="{top}" {size}/>'
 
     parts = [
-        _tag("rect", class_="shade", x=x(a), y=top, width=max(1.0, x(b - 1) - x(a)), height=height)
+        box("shade", x(a), x(b - 1))
         for start, stop in scanned.intervals
         if (a := max(start, begin)) < (b := min(stop, end))
     ]
-    parts.append(_tag("rect", class_="frame", x=_LEFT, y=top, width=width, height=height))
-    if is_limited:
-        parts.append(_tag("line", class_="limit", x1=_LEFT, x2=right, y1=y(limit), y2=y(limit)))
-    if scanned.first is not None and scanned.first in rows:
-        at = x(scanned.first)
-        parts.append(_tag("line", class_="first", y1=top, y2=bottom, x1=at, x2=at))
-    for run in runs_of(np.isfinite(visible)):
-        points = " ".join(f"{x(begin + r):.1f},{y(v):.1f}" for r, v in _thinned(visible, *run))
-        parts.append(_tag("polyline", class_="curve", points=points))
-    for line, value in ((top + 12, high), (bottom - 4, low)):
-        parts.append(text(_LEFT - 6, line, figure(10**value if logarithmic else value)))
-    parts.append(_tag("text", html.escape(name), class_="name", x=_LEFT, y=top - 5))
-    if is_limited:
-        parts.append(text(right, top - 5, f"dashed: threshold {figure(scanned.threshold)}"))
-    parts.append(text(float(_LEFT), bottom + 13, f"row {begin}", "start"))
-    parts.append(text(float(right), bottom + 13, f"row {end - 1}"))
-    return "".join(parts)
+    parts.append(box("frame", _LEFT, right))
+    for run in runs_of(np.isfinite(band[0] + band[1])):
+        outline = " ".join([*points(band[1], *run), *points(band[0], *run)[::-1]])
+        parts.append(f'<polygon class="usual" points="{outline}"/>')
+    parts += [
+        f'<polyline class="curve" points="{" ".join(points(visible, *run))}"/>'
+        for run in runs_of(np.isfinite(visible))
+    ]
+    if scanned.first is not None and scanned.first in span:
+        parts.append(line("first", x(scanned.first), top, x(scanned.first), bottom))
+    if math.isfinite(limit):
+        parts.append(line("limit", _LEFT, y(limit), right, y(limit)))
+        parts.append(text(right, top - 5, f"dashed: threshold {figure(limit)}"))
+    parts.append(text(_LEFT, top - 5, name, 'class="name"'))
+    parts += [text(_LEFT - 6, top + 12, figure(high)), text(_LEFT - 6, bottom - 4, figure(low))]
+    parts.append(text(_LEFT, bottom + 13, f"row {begin}", ""))
+    return "".join([*parts, text(right, bottom + 13, f"row {end - 1}")])
 
 
 def _thinned(values: Floats, start: int, stop: int) -> list[tuple[int, float]]:

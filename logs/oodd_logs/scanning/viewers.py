@@ -4,6 +4,7 @@ import json
 import math
 from pathlib import Path
 from typing import Any, Final
+from urllib.parse import quote, urlencode
 
 import numpy as np
 from oodd_live.reading import as_nanoseconds
@@ -14,6 +15,7 @@ from oodd_eval.errors import MissingExtraError
 from oodd_logs.scanning.scan import Scan, ScannedEpisode
 
 _EXTRA: Final = "pip install 'oodd-eval[viewers]'"
+_AROUND: Final = 100  # rows before and after the odd one that a tab of Rerun shows
 _NUMBER: Final = {"type": ["number", "null"]}
 _VERDICT: Final = {
     "score": _NUMBER,
@@ -24,12 +26,31 @@ _VERDICT: Final = {
 }
 
 
-def write_rerun(scan: Scan, path: Path) -> None:
+def foxglove_link(scanned: ScannedEpisode, address: str) -> str:
+    """Return a link that opens a served MCAP file in Foxglove, at an episode's first odd row.
+
+    The form is that of https://docs.foxglove.dev/docs/visualization/shareable-links. There is none
+    for files that are not served.
+
+    Parameters
+    ----------
+    scanned
+        The episode.
+    address
+        Of the file, http or https. Its server has to allow byte ranges and other origins.
+    """
+    moment = np.datetime64(_stamp(scanned, scanned.first or 0), "ns")
+    parameters = {"ds": "remote-file", "ds.url": address, "time": f"{moment}Z"}
+    return f"foxglove://open?{urlencode(parameters, quote_via=quote, safe='')}"
+
+
+def write_rerun(scan: Scan, path: Path, first: int = 10) -> None:
     """Write a scan as a recording of Rerun, which no viewer is started for.
 
     Each episode is an entity ``/NAME`` with ``sensors/SENSOR``, ``score``, ``statistic``,
     ``threshold`` and ``alarm`` over the timelines ``row`` and, where there are stamps, ``time``,
-    and a text ``suspects`` at its first odd row.
+    and a text ``suspects`` at its first odd row. It opens with a tab for each of the first
+    episodes: the suspects and the statistic about that row.
 
     Parameters
     ----------
@@ -37,6 +58,8 @@ def write_rerun(scan: Scan, path: Path) -> None:
         What to write.
     path
         The file, ``.rrd``.
+    first
+        Number of tabs.
 
     Raises
     ------
@@ -47,29 +70,59 @@ def write_rerun(scan: Scan, path: Path) -> None:
         import rerun as rr  # noqa: PLC0415
     except ImportError:
         raise MissingExtraError(f"a recording for Rerun needs rerun-sdk: {_EXTRA}") from None
+    names = _names(scan)
+    tabs = [_tab(scanned, names[scanned.place]) for scanned in scan.ranked[:first]]
     with replacing(path) as temporary:
         recording = rr.RecordingStream("oodd-eval scan")
-        recording.save(temporary)
-        for name, scanned in _named(scan):
+        recording.save(temporary, rr.blueprint.Blueprint(rr.blueprint.Tabs(*tabs)))
+        for scanned in scan.episodes:
+            name, time = names[scanned.place], scanned.episode.time
 
             def send(entity: tuple[str, ...], rows: Any, columns: Any) -> None:
                 timelines = [rr.TimeColumn("row", sequence=rows)]
-                if (time := scanned.episode.time) is not None:  # noqa: B023  called in this turn
-                    timelines.append(rr.TimeColumn("time", duration=time[rows]))
+                if time is not None:  # noqa: B023  called in this turn
+                    timelines.append(rr.TimeColumn("time", duration=time[rows]))  # noqa: B023
                 path = rr.new_entity_path([name, *entity])  # noqa: B023
                 recording.send_columns(path, timelines, columns)
 
             usable = np.arange(len(scanned.scores))
-            if scanned.episode.time is not None:
-                usable = usable[np.isfinite(scanned.episode.time)]
+            if time is not None:
+                usable = usable[np.isfinite(time)]
             for entity, values in _series(scanned, scan).items():
                 rows = usable[np.isfinite(values[usable])]
                 send(entity, rows, rr.Scalars.columns(scalars=values[rows]))
-            if (first := scanned.first) is not None and first in usable:
+            if (row := scanned.first) is not None and row in usable:
                 text = [", ".join(scanned.suspects)]
-                send(("suspects",), np.array([first]), rr.TextLog.columns(text=text))
+                send(("suspects",), np.array([row]), rr.TextLog.columns(text=text))
         recording.flush()
         recording.disconnect()
+
+
+def _tab(scanned: ScannedEpisode, name: str) -> Any:
+    """Return views of the suspects and the statistic of an episode, about its first odd row."""
+    import rerun as rr  # noqa: PLC0415
+
+    views, ranges, time = rr.blueprint, [], scanned.episode.time
+    if (row := scanned.first) is not None:
+        ends = [max(0, row - _AROUND), min(len(scanned.scores) - 1, row + _AROUND)]
+        boundaries = {"row": [rr.TimeRangeBoundary.absolute(seq=end) for end in ends]}
+        if time is not None and np.isfinite(time[ends]).all():
+            seconds = time[ends].tolist()
+            boundaries["time"] = [rr.TimeRangeBoundary.absolute(seconds=end) for end in seconds]
+        ranges = [
+            rr.VisibleTimeRange(timeline, start=start, end=end)
+            for timeline, (start, end) in boundaries.items()
+        ]
+
+    def view(title: str, *entities: list[str]) -> Any:
+        paths = [rr.new_entity_path([name, *entity]) for entity in entities]
+        return views.TimeSeriesView(
+            origin=rr.new_entity_path([name]), contents=paths, name=title, time_ranges=ranges
+        )
+
+    suspects = [["sensors", sensor] for sensor in scanned.suspects or scanned.sensors]
+    statistic = view("statistic", ["statistic"], ["threshold"])
+    return views.Vertical(view("suspects", *suspects), statistic, name=name)
 
 
 def write_mcap(scan: Scan, path: Path) -> None:
@@ -94,7 +147,7 @@ def write_mcap(scan: Scan, path: Path) -> None:
         from mcap.writer import Writer  # noqa: PLC0415
     except ImportError:
         raise MissingExtraError(f"MCAP needs the library mcap: {_EXTRA}") from None
-    readings = dict.fromkeys(scan.sensors, _NUMBER)
+    readings, names = dict.fromkeys(scan.sensors, _NUMBER), _names(scan)
     with replacing(path) as temporary, temporary.open("wb") as file:
         writer = Writer(file)
         writer.start(library="oodd-eval")
@@ -102,15 +155,13 @@ def write_mcap(scan: Scan, path: Path) -> None:
         for kind, properties in (("sensors", readings), ("oodd", _VERDICT)):
             schema = json.dumps({"type": "object", "properties": properties}).encode()
             schemas[kind] = writer.register_schema(f"oodd.{kind}", "jsonschema", schema)
-        for name, scanned in _named(scan):
+        for scanned in scan.episodes:
             channels = {
-                kind: writer.register_channel(f"/{name}/{kind}", "json", schema)
+                kind: writer.register_channel(f"/{names[scanned.place]}/{kind}", "json", schema)
                 for kind, schema in schemas.items()
             }
             for t, alarm in enumerate(scanned.alarms.tolist()):
-                time, message = scanned.episode.time, _message(scanned, scan, t, alarm=alarm)
-                seconds = float(t if time is None else time[t])
-                stamp = max(0, as_nanoseconds(seconds)) if math.isfinite(seconds) else 0
+                message, stamp = _message(scanned, scan, t, alarm=alarm), _stamp(scanned, t)
                 for kind, channel in channels.items():
                     content = json.dumps(without_nan(message[kind])).encode()
                     writer.add_message(channel, stamp, content, stamp, t)
@@ -118,13 +169,20 @@ def write_mcap(scan: Scan, path: Path) -> None:
         finish()
 
 
-def _named(scan: Scan) -> list[tuple[str, ScannedEpisode]]:
-    """Return the episodes by name, with their number where a name occurs twice."""
+def _stamp(scanned: ScannedEpisode, row: int) -> int:
+    """Return the nanoseconds of a row; without time stamps rows are a second apart."""
+    time = scanned.episode.time
+    seconds = float(row if time is None else time[row])
+    return max(0, as_nanoseconds(seconds)) if math.isfinite(seconds) else 0
+
+
+def _names(scan: Scan) -> dict[int, str]:
+    """Return the names of episodes by place, with their number where a name occurs twice."""
     names = [scanned.episode.name for scanned in scan.episodes]
-    return [
-        (name if names.count(name) == 1 else f"{name} ({i})", scanned)
+    return {
+        scanned.place: name if names.count(name) == 1 else f"{name} ({i})"
         for i, (name, scanned) in enumerate(zip(names, scan.episodes, strict=True))
-    ]
+    }
 
 
 def _series(scanned: ScannedEpisode, scan: Scan) -> dict[tuple[str, ...], Any]:
