@@ -23,13 +23,14 @@ from oodd_eval.data.parts import CALIBRATION, TRAIN, TWINS
 from oodd_eval.errors import TrajectoryError, UnknownNameError, UsageError
 from oodd_eval.metrics.faults import FAR
 from oodd_eval.names import check_known, counted
+from oodd_logs.kinds import Matrix
 from oodd_logs.ledger import Item, Ledger
 from oodd_logs.marks import AnomalousRows, IntervalList, merged, rows_of
 from oodd_logs.readers import in_order as natural_order
 from oodd_logs.recipe import FAILURE, AnomalousFiles, Recipe, anomaly_name
 from oodd_logs.recorded import FILES, NOMINAL_ROLES, SLOWER, Recorded, StampedRows, text_of
 from oodd_logs.recording import Recording
-from oodd_logs.rows import Converter, Matrix, Spool, spool_stretch
+from oodd_logs.rows import Converter, Spool, spool_stretch
 from oodd_logs.selecting import (
     ChosenColumn,
     Layout,

@@ -358,7 +358,7 @@ def import_frames(
     recorded = [
         Recorded(recording, Path(title), title, frozenset(either if part == "test" else {part}))
         for part, episodes in parts.items()
-        for title, table in recordings_of(f"{part}-", episodes, recipe.time)
+        for title, table in recordings_of(f"{part}-", episodes, next(iter(recipe.time), ""))
         for recording in split_recording(table, recipe.episode)
     ]
     if not recipe.sensors and recorded:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Final, Literal, cast, get_args, get_origin, get_type_hints
 
 from oodd_eval.data.bounded import read_toml
 from oodd_eval.data.facts import (
@@ -24,6 +24,7 @@ from oodd_eval.data.facts import (
 )
 from oodd_eval.errors import UnknownNameError, UsageError
 from oodd_eval.names import check_known
+from oodd_logs.kinds import kinds_by_key
 
 FAILURE: Final = "failure"
 """Kind of the episodes that failed, where a recipe names no other."""
@@ -35,6 +36,7 @@ MISSING_ROWS: Final = 20
 """Most rows in a run whose missing values are held or dropped, unless a recipe says others."""
 
 
+DateOrder = Literal["", "day first", "month first"]
 Missing = Literal["refuse", "hold", "drop", "keep"]
 """Treatments of missing values; they are kept, as NaN, for scans alone."""
 Interval = tuple[str, int | float | str | None, int | float | str | None, str]
@@ -63,37 +65,39 @@ def anomaly_name(text: str) -> str:
 # Readers of values: each takes what messages call the key, and the value.
 
 
-def _wrong(key: str, value: Any, expected: str) -> UsageError:
+def wrong_value(key: str, value: Any, expected: str) -> UsageError:
+    """Return the error for a value of a recipe: what it is, and what was expected."""
     return UsageError(f"{key} is {value!r:.100}, expected {expected}")
 
 
 def _text(key: str, value: Any) -> str:
     if not isinstance(value, str) or not value.isprintable():
-        raise _wrong(key, value, "a text in one line")
+        raise wrong_value(key, value, "a text in one line")
     return value
 
 
-def _texts(key: str, value: Any) -> tuple[str, ...]:
+def read_names(key: str, value: Any) -> tuple[str, ...]:
+    """Return names or globs, of which a recipe has one or a list; `UsageError` for others."""
     values = value if isinstance(value, list | tuple) else [value]
     texts = tuple(_text(key, text) for text in values)
     if "" in texts:
-        raise _wrong(key, value, "texts that are not empty")
+        raise wrong_value(key, value, "texts that are not empty")
     return texts
 
 
 def _globs(key: str, value: Any) -> tuple[str, ...]:
-    patterns = _texts(key, value)
+    patterns = read_names(key, value)
     for pattern in patterns:
         if pattern.startswith(("/", "~")) or re.match(r"[A-Za-z]:|.*\\", pattern):
-            raise _wrong(key, pattern, "paths relative to the recipe's folder, or to --root")
+            raise wrong_value(key, pattern, "paths relative to the recipe's folder, or to --root")
         if ".." in pattern.split("/"):
-            raise _wrong(key, pattern, "paths without '..': choose a folder above with --root")
+            raise wrong_value(key, pattern, "paths without '..': choose a folder above with --root")
     return patterns
 
 
 def _number(key: str, value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 1e12:
-        raise _wrong(key, value, "a number above 0")
+        raise wrong_value(key, value, "a number above 0")
     return float(value)
 
 
@@ -102,7 +106,7 @@ def _whole(least: int, also: int | None = None) -> Callable[[str, Any], int]:
         is_whole = isinstance(value, int) and not isinstance(value, bool)
         if not is_whole or not (least <= value < 2**53 or value == also):
             zero = f", or {also} for none" if also is not None else ""
-            raise _wrong(key, value, f"a whole number from {least} on{zero}")
+            raise wrong_value(key, value, f"a whole number from {least} on{zero}")
         return int(value)
 
     return read
@@ -111,7 +115,7 @@ def _whole(least: int, also: int | None = None) -> Callable[[str, Any], int]:
 def _one_of(types: Any, expected: str) -> Callable[[str, Any], Any]:
     def read(key: str, value: Any) -> Any:
         if not isinstance(value, types):
-            raise _wrong(key, value, expected)
+            raise wrong_value(key, value, expected)
         return value
 
     return read
@@ -143,12 +147,12 @@ def _conditions(key: str, value: Any) -> dict[str, tuple[Any, ...]]:
 def _roles(key: str, value: Any) -> dict[str, tuple[str, ...]]:
     table = _table(key, value)
     check_known(f"role of {key}", get_args(Role), *table)
-    return {role: _texts(f"{key}.{role}", globs) for role, globs in table.items()}
+    return {role: read_names(f"{key}.{role}", globs) for role, globs in table.items()}
 
 
 def _discrete(key: str, value: Any) -> int | tuple[str, ...]:
     if isinstance(value, list | tuple):
-        return _texts(key, value)
+        return read_names(key, value)
     return _whole(0)(key, value)
 
 
@@ -156,7 +160,7 @@ def _shares(key: str, value: Any) -> tuple[float, ...]:
     shares = value if isinstance(value, list | tuple) else ()
     numbers = all(isinstance(s, int | float) and 0 <= s <= 1 for s in shares)
     if len(shares) not in {2, 3} or not numbers or abs(sum(shares) - 1) > 1e-6 or 0 in shares[:2]:
-        raise _wrong(
+        raise wrong_value(
             key,
             value,
             "shares of training, calibration and test with the sum 1, the first two above 0",
@@ -171,7 +175,7 @@ def _intervals(key: str, value: Any) -> str | tuple[Interval, ...]:
     intervals = []
     for row in rows:
         if not isinstance(row, list | tuple) or len(row) not in {3, 4}:
-            raise _wrong(key, row, "[file, start, stop] or [file, start, stop, kind]")
+            raise wrong_value(key, row, "[file, start, stop] or [file, start, stop, kind]")
         kind = _text(key, row[3]) if len(row) == 4 else ""
         intervals.append((_text(key, row[0]), _moment(key, row[1]), _moment(key, row[2]), kind))
     return tuple(intervals)
@@ -184,12 +188,12 @@ def _moment(key: str, value: Any) -> int | float | str | None:
     if isinstance(value, dt.date):
         return value.isoformat()
     if isinstance(value, bool) or not isinstance(value, int | float | str):
-        raise _wrong(key, value, "a row, a time in seconds with a decimal point, or ISO 8601")
+        raise wrong_value(key, value, "a row, a time in seconds with a decimal point, or ISO 8601")
     return value
 
 
 Text = Annotated[str, _text]
-Texts = Annotated[tuple[str, ...], _texts]
+Texts = Annotated[tuple[str, ...], read_names]
 Globs = Annotated[tuple[str, ...], _globs]
 Conditions = Annotated[Mapping[str, tuple[Any, ...]], _conditions]
 Flag = Annotated[bool, _flag]
@@ -285,8 +289,11 @@ class Recipe:
     source, licence, citation
         Where the logs are from.
     time
-        Column with time stamps, ``NAME[s]``, ``[ms]``, ``[us]`` or ``[ns]``, or ISO 8601; empty for
-        the format's own, or none.
+        Column with time stamps, ``NAME[s]``, ``[ms]`` and the like, or dates; several whose times
+        add up, such as date and time of day, or seconds and nanoseconds; empty for the format's
+        own, or none.
+    dates
+        Which of day and month comes first in dates; empty where the cells of each file tell.
     rate
         Rows in a second of the result, to which rows are resampled, the last value held; None for
         rows as they are.
@@ -303,8 +310,8 @@ class Recipe:
         Column with rewards.
     discrete
         Number of actions, or their names, where each action is a whole number from 0 on.
-    angles
-        Globs of sensors that are replaced by their sine and cosine.
+    columns
+        What the keys of kinds of columns say, such as ``angles``, by key; see `oodd_logs.kinds`.
     roles
         Globs of sensors by their role, see `oodd_eval.Quantity`. Sine and cosine of angles that are
         replaced by them have these roles where the sensor's is ``"angle"``.
@@ -355,7 +362,8 @@ class Recipe:
     source: Text = ""
     licence: Text = ""
     citation: Text = ""
-    time: Text = ""
+    time: Texts = ()
+    dates: Annotated[DateOrder, _choice("day first", "month first")] = ""
     rate: Number = None
     gap: Number = None
     episode: Texts = ()
@@ -363,7 +371,7 @@ class Recipe:
     actions: Texts = ()
     reward: Text = ""
     discrete: Annotated[int | tuple[str, ...], _discrete] = 0
-    angles: Texts = ()
+    columns: Mapping[str, Any] = field(default_factory=dict)
     roles: Annotated[Mapping[str, tuple[str, ...]], _roles] = field(default_factory=dict)
     constant: Annotated[Literal["keep", "drop"], _choice("keep", "drop")] = "keep"
     missing: Annotated[Missing, _choice("refuse", "hold", "drop")] = "refuse"
@@ -445,6 +453,7 @@ class Recipe:
         if "split" not in values:
             raise UsageError(f"{source} lacks the key 'split', the name of the split to make")
         options = dict(values.pop("read", {}))
+        values["columns"] = {key: values.pop(key) for key in kinds_by_key() if key in values}
         files = {"format": _text("[read]: format", options.pop("format", "")), "options": options}
         recipe = cls(**{"environment": values["split"]} | values | files)
         recipe.check(source)
@@ -519,10 +528,13 @@ def _readers(table: type) -> dict[str, _Reader]:
 
 def _checked(source: str, content: Mapping[str, Any], table: type) -> dict[str, Any]:
     """Return the values of keys, each checked by its reader; unknown keys are errors."""
-    readers = _readers(table) | ({"read": _table} if table is Recipe else {})
+    readers = _readers(table)
+    if table is Recipe:
+        kinds = {key: cast("_Reader", kind.check) for key, kind in kinds_by_key().items()}
+        readers = {**readers, "read": _table, **kinds}
     check_known(f"key of {source}", readers, *content)
     return {key: readers[key](f"{source}: {key}", value) for key, value in content.items()}
 
 
 KEYS: Final = ("read", *_readers(Recipe))
-"""Keys of a recipe, in the order in which one is written."""
+"""Keys of a recipe but for those of kinds of columns, in the order in which one is written."""

@@ -10,23 +10,15 @@ from numpy.typing import NDArray
 
 from oodd_eval.data.parts import CALIBRATION, TRAIN, TWINS
 from oodd_eval.errors import TrajectoryError, UnknownNameError, UsageError
+from oodd_logs.kinds.times import orders_of, parse_times
 from oodd_logs.ledger import Fate, Item, Ledger
 from oodd_logs.marks import IntervalList, Mark, anomalous_cells, runs_of
 from oodd_logs.readers.cells import mixed
 from oodd_logs.recipe import Recipe, anomaly_name
-from oodd_logs.recording import Recording, parse_times
+from oodd_logs.recording import Column, Recording
 from oodd_logs.rows import TopicRows, read_column
 from oodd_logs.selecting import Selection, find_columns, layout_of, named_columns
-from oodd_logs.stamps import (
-    Steps,
-    Stretch,
-    Times,
-    check_stamps,
-    cut_at_gaps,
-    on_grid,
-    set_forward,
-    unit_of,
-)
+from oodd_logs.stamps import Steps, Stretch, Times, check_stamps, cut_at_gaps, on_grid, set_forward
 
 FILES: Final = "files"
 """Role of the nominal files whose episodes are shared out."""
@@ -172,22 +164,27 @@ class StampedRows:
 
     def _read(self, topic: str) -> Times:
         """Return the stamps of a topic in seconds, NaN where a row has none."""
-        source, column = self._recorded.source, self._selection.times[topic]
+        source, rows = self._recorded.source, self._recorded.recording.topics[topic]
         is_strict = self._recipe.missing == "refuse"
-        parsed: list[Times] = [np.empty(0)]
-        for start, cells in read_column(self._recorded.recording.topics[topic], column.column):
-            what = f"{source}, column {column.column!r}"
+        stamps = np.zeros(rows.rows)
+        for column in self._selection.times[topic] if rows.rows else ():
+            # All at once: one cell may tell day from month in the others.
+            cells = np.concatenate([cells for _start, cells in read_column(rows, column.column)])
+            arguments = (
+                column.quantity.unit,
+                self._order(cells),
+                f"{source}, column {column.column!r}",
+            )
             try:
-                times = _seconds(cells, column.quantity.unit, what)
+                times = _seconds(cells, *arguments)
             except TrajectoryError:
-                times = np.empty(0) if is_strict else _tolerant(cells, column.quantity.unit, what)
+                times = np.empty(0) if is_strict else _tolerant(cells, *arguments)
                 if is_strict or 2 * np.isnan(times).sum() >= len(times):
                     raise
-            rows = np.flatnonzero(~np.isfinite(times))
-            cell = str(cells[rows[0]]) if len(rows) and cells.dtype.kind == "U" else ""
-            self._say("dropped", "without a stamp", start + rows, cell, column.column)
-            parsed.append(times)
-        stamps = np.concatenate(parsed)
+            lacking = np.flatnonzero(~np.isfinite(times))
+            cell = str(cells[lacking[0]]) if len(lacking) and cells.dtype.kind == "U" else ""
+            self._say("dropped", "without a stamp", lacking, cell, column.column)
+            stamps += times
         missing = ~np.isfinite(stamps)
         if missing.any() and is_strict:
             raise TrajectoryError(
@@ -211,6 +208,11 @@ class StampedRows:
             self._ledger.add(
                 item, fate, reason, name=name, count=count, source=source, row=row, cell=cell
             )
+
+    def _order(self, cells: Column) -> str:
+        """Return the order of day and month in dates, empty where it is not told."""
+        orders = orders_of(cells) if cells.dtype.kind == "U" and not self._recipe.dates else ()
+        return orders[0] if len(orders) == 1 else self._recipe.dates
 
     def stretches(self) -> tuple[list[Stretch], list[Times]]:
         """Return the rows that become episodes, on an even grid or as they are, and their stamps.
@@ -356,9 +358,10 @@ class StampedRows:
         if topic in self._stamps:
             times = self._stamps[topic]
             if mark.stop <= np.nanmin(times) or mark.start > np.nanmax(times):
-                column = self._selection.times[topic].column
-                cells = self._recorded.recording.topics[topic].read([column], 0, len(times))[column]
-                first, last = (str(cells[np.isfinite(times)][i]) for i in (0, -1))
+                columns = [column.column for column in self._selection.times[topic]]
+                cells = self._recorded.recording.topics[topic].read(columns, 0, len(times))
+                rows = np.flatnonzero(np.isfinite(times))[[0, -1]].tolist()
+                first, last = (" ".join(str(cells[name][i]) for name in columns) for i in rows)
                 raise TrajectoryError(
                     f"{self._recorded.source}: an anomaly is from {start} to {stop}, expected a "
                     f"part of the recording, whose first stamp is {first} and its last {last}"
@@ -395,8 +398,10 @@ class StampedRows:
                 f"{source}: {moment!r} is a time, but there are no stamps: name their column with "
                 "time, or name rows, which are whole numbers"
             )
-        unit = self._selection.times[topic].quantity.unit
-        time = float(_seconds(np.array([moment]), unit, f"{source}: an anomaly")[0])
+        columns = self._selection.times[topic]
+        unit = columns[0].quantity.unit if len(columns) == 1 else ""
+        where = f"{source}: an anomaly"
+        time = float(_seconds(np.array([moment]), unit, self._recipe.dates, where)[0])
         logged = self._logged[topic]
         if logged is stamps:
             return time
@@ -405,18 +410,19 @@ class StampedRows:
         return float(stamps[row] + time - logged[row])
 
 
-def _tolerant(cells: NDArray[Any], unit: str, source: str) -> Times:
+def _tolerant(cells: NDArray[Any], unit: str, order: str, source: str) -> Times:
     """Return stamps, NaN for the cells that are none."""
     try:
-        return _seconds(cells, unit, source)
+        return _seconds(cells, unit, order, source)
     except TrajectoryError:
         if len(cells) == 1:
             return np.array([np.nan])
     middle = len(cells) // 2
-    return np.append(*(_tolerant(x, unit, source) for x in (cells[:middle], cells[middle:])))
+    halves = (_tolerant(x, unit, order, source) for x in (cells[:middle], cells[middle:]))
+    return np.append(*halves)
 
 
-def _seconds(cells: NDArray[Any], unit: str, source: str) -> Times:
+def _seconds(cells: NDArray[Any], unit: str, order: str, source: str) -> Times:
     if cells.dtype.kind == "U":
         stamps, is_text = mixed(cells)
         if np.isfinite(stamps).sum() > is_text.sum():  # numbers, and few texts
@@ -426,6 +432,6 @@ def _seconds(cells: NDArray[Any], unit: str, source: str) -> Times:
                 raise TrajectoryError(f"{source}: row {row}: {text}, expected a number")
             cells = stamps
     try:
-        return parse_times(cells, "" if cells.dtype.kind == "U" else unit_of(unit))
+        return parse_times(cells, "" if cells.dtype.kind == "U" else unit, order)
     except (TrajectoryError, UsageError) as error:
         raise TrajectoryError(f"{source}: {error}") from None

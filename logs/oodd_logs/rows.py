@@ -1,4 +1,4 @@
-"""Rows of a recording for an episode: read in blocks, missing values held, angles unwrapped.
+"""Rows of a recording for an episode: read in blocks, missing values held, columns converted.
 
 Nothing here holds more than a block of a recording; what comes out is float64.
 """
@@ -6,7 +6,7 @@ Nothing here holds more than a block of a recording; what comes out is float64.
 import contextlib
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, Final, cast
 
@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from oodd_eval.data.facts import Quantity, Role
 from oodd_eval.errors import OutputError, TrajectoryError, UsageError
+from oodd_logs.kinds import Conversion, Matrix, kinds_by_key
+from oodd_logs.kinds.angles import FULL_TURN
 from oodd_logs.ledger import Fate, Item, Ledger
 from oodd_logs.readers.cells import mixed
 from oodd_logs.recipe import Recipe
@@ -25,9 +27,6 @@ from oodd_logs.stamps import Stretch
 _CELLS: Final = 1 << 18  # that are read at once
 _MOST_CHOICES: Final = 64
 _MOST_ACTIONS: Final = 1000  # of discrete ones, each a column
-_FULL_TURN: Final = {"deg": 180.0, "°": 180.0, "degree": 180.0, "degrees": 180.0}
-
-Matrix = NDArray[np.float64]
 
 
 def read_column(topic: Topic, column: str) -> Iterator[tuple[int, NDArray[Any]]]:
@@ -251,7 +250,7 @@ class Converter:
     selection
         Columns of the first recording.
     recipe
-        Its angles and discrete actions.
+        What becomes of its columns, and its discrete actions.
     start
         Number of the first discrete action.
 
@@ -264,26 +263,31 @@ class Converter:
     def __init__(self, selection: Selection, recipe: Recipe, start: int = 0) -> None:
         self._inputs = len(selection.sensors), len(selection.actions)
         quantities = _with_roles([column.quantity for column in selection.sensors], recipe)
-        names = [quantity.name for quantity in quantities]
-        matches_any(recipe.angles, names, "sensor that is an angle")
-        self._angles = [matches_any(recipe.angles, [name]) for name in names]
-        sensors: list[Quantity] = []
-        for quantity, is_angle in zip(quantities, self._angles, strict=True):
-            if is_angle and quantity.unit not in {"1", "rad", *_FULL_TURN}:
+        by_first: dict[int, Conversion] = {}
+        converted: dict[int, str] = {}
+        for key, value in recipe.columns.items():
+            kind = kinds_by_key()[key]
+            for conversion in kind.convert(value, quantities) if kind.convert else ():
+                by_first[min(conversion.inputs)] = conversion
+                for i in conversion.inputs:
+                    if i in converted:
+                        name = quantities[i].name
+                        raise UsageError(
+                            f"{name!r} is named below {converted[i]} and {key}, expected one"
+                        )
+                    converted[i] = key
+        order = [i for i in range(len(quantities)) if i in by_first or i not in converted]
+        self._parts = [
+            by_first.get(i, Conversion((i,), (quantities[i],), _as_it_is)) for i in order
+        ]
+        self._made = [part.make() for part in self._parts]
+        self.sensors = tuple(quantity for part in self._parts for quantity in part.outputs)
+        for sensor in self.sensors:
+            if sensor.role == "angle" and sensor.unit in FULL_TURN:
                 raise UsageError(
-                    f"angles: {quantity.name!r} is in {quantity.unit}, expected rad or deg, as in "
-                    f"sensors = ['{quantity.name}[rad]']"
+                    f"roles: the angle {sensor.name!r} is in {sensor.unit}, expected rad; list it "
+                    "under angles, too, to replace it by sine and cosine"
                 )
-            halves: dict[str, Role] = {"sin": "sine", "cos": "cosine"}
-            parts = [
-                Quantity(
-                    f"{f} {quantity.name}", "1", half if quantity.role == "angle" else quantity.role
-                )
-                for f, half in halves.items()
-            ]
-            sensors += parts if is_angle else [quantity]
-        self.sensors = tuple(sensors)
-        self._scales = [np.pi / _FULL_TURN.get(q.unit, np.pi) for q in quantities]
         self._start = start
         self.actions = _actions(selection.actions, recipe)
         self.discrete = bool(recipe.discrete)
@@ -306,11 +310,12 @@ class Converter:
         """
         sensors, actions = self._inputs
         out = np.zeros((len(cells), self.width))
-        columns: list[NDArray[np.float64]] = []
-        for values, angle, scale in zip(cells.T, self._angles, self._scales, strict=False):
-            columns += [np.sin(values * scale), np.cos(values * scale)] if angle else [values]
-        at = len(columns)
-        out[:, :at] = np.stack(columns, axis=1)
+        at = 0
+        if not first:
+            self._made = [part.make() for part in self._parts]
+        for part, make in zip(self._parts, self._made, strict=True):
+            out[:, at : at + len(part.outputs)] = make(cells[:, part.inputs])
+            at += len(part.outputs)
         commands = cells[:, sensors : sensors + actions]
         if self._choices is not None:
             self._choices |= {*np.unique(commands).tolist()[: _MOST_CHOICES + 1]}
@@ -341,7 +346,7 @@ class Converter:
 
 
 def _with_roles(sensors: Sequence[Quantity], recipe: Recipe) -> list[Quantity]:
-    """Return sensors with the roles that a recipe names, one each, angles in radians."""
+    """Return sensors with the roles that a recipe names, one each."""
     names = [sensor.name for sensor in sensors]
     named: dict[str, list[str]] = {}
     for role, patterns in recipe.roles.items():
@@ -353,12 +358,6 @@ def _with_roles(sensors: Sequence[Quantity], recipe: Recipe) -> list[Quantity]:
         roles = named.get(sensor.name, [])
         if len(roles) > 1:
             raise UsageError(f"roles: {sensor.name!r} is {' and '.join(roles)}, expected one role")
-        turned = matches_any(recipe.angles, [sensor.name])
-        if roles == ["angle"] and sensor.unit in _FULL_TURN and not turned:
-            raise UsageError(
-                f"roles: the angle {sensor.name!r} is in {sensor.unit}, expected rad; list it "
-                "under angles, too, to replace it by sine and cosine"
-            )
     return [replace(q, role=cast("Role", named.get(q.name, [q.role])[0])) for q in sensors]
 
 
@@ -378,6 +377,10 @@ def _actions(columns: Sequence[ChosenColumn], recipe: Recipe) -> tuple[Quantity,
             "each becomes a column: import them as amounts, without discrete"
         )
     return tuple(Quantity(f"action {i}", "1") for i in range(recipe.discrete))
+
+
+def _as_it_is() -> Callable[[Matrix], Matrix]:
+    return lambda rows: rows
 
 
 class Spool:

@@ -10,6 +10,7 @@ import unicodedata
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Final
 
 from oodd_eval.data.facts import Quantity
@@ -50,7 +51,7 @@ class Selection:
     reward
         Rewards, if any.
     times
-        Column with stamps by topic, and its unit.
+        Columns whose stamps add up, by topic, with their units.
     labels
         Those of the recipe's label columns that there are, by their text in the recipe.
     unused
@@ -60,7 +61,7 @@ class Selection:
     sensors: tuple[ChosenColumn, ...]
     actions: tuple[ChosenColumn, ...]
     reward: ChosenColumn | None
-    times: dict[str, ChosenColumn]
+    times: dict[str, tuple[ChosenColumn, ...]]
     labels: dict[str, ChosenColumn]
     unused: tuple[str, ...]
 
@@ -140,7 +141,7 @@ def respellings(layout: Layout, recipe: Recipe, first: Layout | None) -> dict[tu
 
     pairs = [(topic, name, spelled(topic, name)) for topic, name in expected - there]
     names = {(topic, old): name for topic, name, old in pairs if old}
-    texts = (*_texts_of(recipe), *recipe.sensors, *recipe.actions, recipe.reward, recipe.time)
+    texts = (*_texts_of(recipe), *recipe.sensors, *recipe.actions, recipe.reward, *recipe.time)
     plain = [t.rpartition("=")[2].strip() for t in texts if t and not {*t} & {*"*?"}]
     exact = {text: _exact(layout, text) for text in plain}
     taken = {column for columns in exact.values() for column in columns}
@@ -252,7 +253,7 @@ def select_columns(layout: Layout, recipe: Recipe, source: str) -> Selection:
     }
     used = [*sensors, *actions, *rewards[:1], *labels.values()]
     times = _times(layout, dict.fromkeys(column.topic for column in used), recipe.time, source)
-    named = {(c.topic, c.column) for c in (*used, *fields, *times.values())}
+    named = {(c.topic, c.column) for c in (*used, *fields, *chain(*times.values()))}
     layout_columns = [(topic, name) for topic, names, _ in layout for name in names]
     unused = tuple(_aliases(*column)[-1] for column in layout_columns if column not in named)
     if by_prefix:
@@ -273,7 +274,7 @@ def unnamed_columns(layout: Layout, recipe: Recipe) -> tuple[str, ...]:
     columns = [(topic, name) for topic, names, _ in layout for name in names]
     if any((match := _PREFIX.match(name)) and match[1].lower() == "obs" for _, name in columns):
         return ()
-    texts = [*recipe.actions, *_texts_of(recipe), *filter(None, (recipe.reward, recipe.time))]
+    texts = [*recipe.actions, *_texts_of(recipe), *recipe.time, *filter(None, [recipe.reward])]
     named = {(c.topic, c.column) for text in texts for c in find_columns(layout, text)}
     unnamed = (column for column in columns if column not in named)
     return tuple(f"{topic}.{name}" if topic else name for topic, name in unnamed)
@@ -324,23 +325,29 @@ def _listed(layout: Layout, texts: Sequence[str], source: str) -> list[ChosenCol
 
 
 def _times(
-    layout: Layout, topics: Iterable[str], text: str, source: str
-) -> dict[str, ChosenColumn]:
+    layout: Layout, topics: Iterable[str], texts: Sequence[str], source: str
+) -> dict[str, tuple[ChosenColumn, ...]]:
     """Return the columns with stamps by topic, as the recipe names them, else as the format."""
-    columns = {column.topic: column for column in find_columns(layout, text)} if text else {}
-    for topic, names, _ in layout if text else ():
-        # One name holds for all topics.
-        for column in find_columns((("", names, ""),), text):
-            columns.setdefault(topic, dataclasses.replace(column, topic=topic))
-    defined = {
-        topic: ChosenColumn(topic, time, Quantity(time, "s")) for topic, _, time in layout if time
-    }
-    if text and not columns:
-        raise UnknownNameError(f"column of {source}", split_unit(text)[0], named_columns(layout))
-    time_columns = defined | columns
-    if text and (without := [topic for topic in topics if topic not in time_columns]):
-        raise TrajectoryError(f"{source}: topic {without[0]!r} has no column {text!r}, its stamps")
-    return {topic: time_columns[topic] for topic in topics if topic in time_columns}
+    found: dict[str, list[ChosenColumn]] = {topic: [] for topic, _, _ in layout}
+    for text in texts:
+        columns = {column.topic: column for column in find_columns(layout, text)}
+        for topic, names, _ in layout:
+            # One name holds for all topics.
+            for column in find_columns((("", names, ""),), text):
+                columns.setdefault(topic, dataclasses.replace(column, topic=topic))
+        if not columns:
+            name = split_unit(text)[0]
+            raise UnknownNameError(f"column of {source}", name, named_columns(layout))
+        for topic, column in columns.items():
+            found[topic].append(column)
+    times: dict[str, tuple[ChosenColumn, ...]] = {}
+    for topic, _, time in layout:
+        defined = (ChosenColumn(topic, time, Quantity(time, "s")),) if time else ()
+        times[topic] = tuple(found[topic]) if texts and len(found[topic]) == len(texts) else defined
+    if texts and (without := [topic for topic in topics if not times[topic]]):
+        absent = " and ".join(map(repr, texts))
+        raise TrajectoryError(f"{source}: topic {without[0]!r} has no column {absent}, its stamps")
+    return {topic: times[topic] for topic in topics if times[topic]}
 
 
 def _named_unit(text: str) -> tuple[str, str]:

@@ -12,7 +12,6 @@ from oodd_eval.errors import TrajectoryError, UsageError
 GAP_STEPS: Final = 20
 """A gap is a step of more than so many usual ones, unless a recipe says how many seconds."""
 
-_UNITS: Final = {"1": "s", "sec": "s", "seconds": "s", "µs": "us", "μs": "us"}
 _TOLERANCE: Final = 1e-3  # share of a step by which a stamp may miss the grid
 _MOST_ROWS: Final = 100  # rows of the grid for one row that was logged
 _UNEVEN: Final = 0.1  # share of a step by which steps of an even recording may differ
@@ -47,11 +46,6 @@ class Stretch:
             return float("nan"), float("nan")
         times = self.positions[start:stop]
         return float(times[0]), float((times[-1] - times[0]) / max(1, len(times) - 1))
-
-
-def unit_of(unit: str) -> str:
-    """Return the name of a unit of time; stamps without a unit are seconds."""
-    return _UNITS.get(unit, unit)
 
 
 @dataclass(frozen=True, slots=True)

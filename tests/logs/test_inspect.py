@@ -111,8 +111,8 @@ def test_what_float32_keeps_and_what_jumps_by_less_is_not_remarked(clean):
     # Steps of float32 are 3e-5 at 300 and .008 at 101 325.
     assert not logs.columns["temperature"].coarse
     assert logs.columns["pressure"].coarse
-    wraps = {name: logs.columns[name].wraps for name in ("heading", "sawtooth", "noise")}
-    assert wraps == {"heading": 360, "sawtooth": 0, "noise": 0}
+    wraps = {name: logs.columns[name].period for name in ("heading", "sawtooth", "noise")}
+    assert wraps == {"heading": 360, "sawtooth": 5, "noise": 0}
 
 
 def after_row_30(by):
@@ -137,7 +137,7 @@ def test_a_clock_of_one_file_is_told(clean, stamps, topic, words):
     assert all(word in remarks[topic] for word in words)
     recipe = Recipe.parse(tomllib.loads(draft(logs)))
     if topic == "falls":
-        assert (recipe.time, recipe.rate, recipe.gap) == ("t", 100, 0.2)
+        assert (recipe.time, recipe.rate, recipe.gap) == (("t",), 100, 0.2)
 
 
 def test_missing_cells_are_counted_at_the_start_and_in_runs(tmp_path):
@@ -194,10 +194,10 @@ def test_units_of_stamps(tmp_path, name, stamps, unit):
 
 def test_a_clock_that_falls_is_no_clock():
     rng = np.random.default_rng(0)
-    random = ClockFacts.of([(0, rng.normal(size=100))])
+    random = ClockFacts.of(np.arange(100), [rng.normal(size=100)])
     assert random.steps.falls > 30
-    assert ClockFacts.of([(0, np.array([1.0]))]) is None
-    assert time_unit("t", [ClockFacts.of([(0, np.arange(9.0))])]) == "s"
+    assert ClockFacts.of(np.arange(1), [np.array([1.0])]) is None
+    assert time_unit("t", [ClockFacts.of(np.arange(9), [np.arange(9.0)])]) == "s"
 
 
 @pytest.mark.parametrize("separator", [";", ","])
@@ -215,7 +215,7 @@ def test_labels_by_rows_sort_the_files(tmp_path, separator):
     assert recipe.sensors == ("q[rad]", "tau[N m]")
     assert recipe.nominal.files == ("free*.csv",)
     assert recipe.anomalous["valve"].files == ("valve*.csv",)
-    assert (recipe.time, recipe.rate) == ("t", 100)
+    assert (recipe.time, recipe.rate) == (("t",), 100)
 
 
 def test_labels_are_often_nominal_and_texts_name_their_nominal_value(tmp_path):
@@ -416,7 +416,7 @@ def test_the_command_prints_and_writes_a_recipe_that_is_read(
     # Files are relative to the recipe, and what is no sensor is left out.
     assert drafted.nominal.files == (f"{clean.name}/*.csv",)
     assert drafted.sensors == ("q[rad]", "tau[N m]", "flags", "angles", "missing", "float32")
-    assert drafted.angles == ("angles",)
+    assert drafted.columns == {"angles": ("angles",)}
     assert drafted.missing == "hold"
     assert main(["data", "inspect", clean.name, "--recipe", "arm.toml"]) == 4
     # A recipe elsewhere names the root.

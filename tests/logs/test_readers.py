@@ -19,11 +19,12 @@ from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from mcap_ros2.writer import Writer as Ros2Writer
 from oodd_logs import readers as logs
+from oodd_logs.kinds.times import parse_times
 from oodd_logs.minari_files import export
 from oodd_logs.readers import Reader, check_reader, library, readers, register_readers
 from oodd_logs.readers.cells import column_names, conventional, nearest_spelling
 from oodd_logs.readers.gathered import Gathered
-from oodd_logs.recording import Recording, Topic, parse_times
+from oodd_logs.recording import Recording, Topic
 from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Bag2Writer
@@ -348,10 +349,11 @@ def test_times_are_seconds():
             parse_times(np.array(["2020-01-01", wrong]))
     with pytest.raises(TrajectoryError, match="expected numbers"):
         parse_times(np.array(["2020-01-01"]), "ms")
-    with pytest.raises(TrajectoryError, match="expected ISO 8601"):
+    with pytest.raises(TrajectoryError, match="expected dates"):
         parse_times(np.array([1.0]), "iso")
-    with pytest.raises(UsageError, match="unknown unit of time 'sec'"):
-        parse_times(np.array([1.0]), "sec")
+    with pytest.raises(UsageError, match="unknown unit of time 'tick'"):
+        parse_times(np.array([1.0]), "tick")
+    assert parse_times(np.array([1.5]), "minutes").tolist() == [90]
     assert parse_times(np.array([], dtype="U1")).tolist() == []
 
 

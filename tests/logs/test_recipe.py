@@ -15,6 +15,7 @@ source = "https://example.org"
 licence = "CC BY 4.0"
 citation = "Doe 2024"
 time = "t[ms]"
+dates = "day first"
 rate = 100
 gap = 2.5
 sensors = ["q*[rad]", "speed = v"]
@@ -69,7 +70,7 @@ def test_every_key_reaches_the_recipe(tmp_path):
     path.write_text(WHOLE)
     recipe = Recipe.load(path)
     content = tomllib.loads(WHOLE)
-    assert {*content} == {*KEYS}
+    assert {*content} == {*KEYS, "angles"}
     plain = Recipe("arm-logs", "arm")
     same = {f.name for f in dataclasses.fields(recipe) if getattr(recipe, f.name) == getattr(plain, f.name)}  # fmt: skip  # noqa: E501
     assert same == {"split", "environment", "paired"}

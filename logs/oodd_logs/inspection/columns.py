@@ -5,29 +5,62 @@ properties say what it looks like: a constant, a flag, a counter, an angle that 
 float32 cannot tell apart.
 """
 
-import contextlib
 import math
-import re
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from oodd_eval.data.offsets import RunningMoments, is_coarse
-from oodd_eval.errors import TrajectoryError
+from oodd_logs.kinds.times import SCALES, orders_of, parse_times, unit_in
+from oodd_logs.ledger import Fate
 from oodd_logs.marks import runs_of
 from oodd_logs.readers.cells import mixed
-from oodd_logs.recording import Column, parse_times
+from oodd_logs.recording import Column
 from oodd_logs.stamps import Steps
 
 FEW: Final = 8
 """Distinct values up to which a column is a flag, or may be a label."""
 
-PERIODS: Final = (2 * math.pi, 360.0)
-"""Full turns in radians and degrees."""
+_PERIODS: Final = (2 * math.pi, 360.0, 1.0, 24.0, 60.0, 100.0, 400.0, 3600.0, 6400.0, 86400.0)
+"""Usual periods: full turns in many units, hours and days; powers of 2 and 10 are others."""
+
+TEXT: Final = "text among numbers"
+_INFINITE: Final = "no finite number"
+_BEYOND: Final = "a million times as far from the median as usual"
+EXCEPTIONS: Final[Mapping[str, Fate]] = {TEXT: "held", _INFINITE: "held", _BEYOND: "kept"}
+"""What becomes of cells that are no such values as most others of a column, by the reason."""
+
+_FAR: Final = 1e6  # median deviations
+_JUMP: Final = 0.45  # share of the range, from which a step may be back to the beginning
+_NEAR: Final = 0.003  # share by which a period is rounded
+
+
+@dataclass(slots=True)
+class Turns:
+    """Steps of a column in one recording by their sizes, compared with the range of the column.
+
+    Parameters
+    ----------
+    jumps, wild
+        Number of steps of about the range, and of others of more than an eighth of it.
+    jumped, size
+        Sum of the jumps, and of their sizes.
+    moved
+        Sum of all other steps.
+    counts
+        Whether all other steps are 1.
+    """
+
+    jumps: int = 0
+    wild: int = 0
+    jumped: float = 0.0
+    size: float = 0.0
+    moved: float = 0.0
+    counts: bool = True
 
 
 @dataclass(slots=True)
@@ -42,16 +75,21 @@ class ColumnFacts:
         Number of cells, and of those without a value.
     leading, longest
         Most missing cells at the start of a recording, and the longest run of them behind that.
-    words
-        By recording, the number of cells that are text, the row of the first, and that.
+    exceptions
+        By reason and recording, the number of cells that are no such values as most others, the
+        row of the first, and its text.
     numbers
         Range, mean and spread of the numbers.
     values
         Cells by value, None where there are more than `FEW` values.
     steps, falls, rises
         Number of differences between neighbouring rows, and of those below and above zero.
-    jumps, wild
-        For each of `PERIODS`, steps of nearly that size, and others of more than an eighth of it.
+    span
+        Range of the numbers on which `turns` are based.
+    turns
+        Of each recording: steps of about the range, the sum of these and of their sizes, other
+        steps of more than an eighth of it, the sum and the sizes of the small ones, the least and
+        the largest of these.
     source, run, at_start, last
         The recording, its missing cells before the next one, whether there was none but these, and
         its last number.
@@ -62,14 +100,14 @@ class ColumnFacts:
     missing: int = 0
     leading: int = 0
     longest: int = 0
-    words: dict[str, tuple[int, int, str]] = field(default_factory=dict)
+    exceptions: dict[tuple[str, str], tuple[int, int, str]] = field(default_factory=dict)
     numbers: RunningMoments = field(default_factory=RunningMoments)
     values: Counter[float | str] | None = field(default_factory=Counter)
     steps: int = 0
     falls: int = 0
     rises: int = 0
-    jumps: list[int] = field(default_factory=lambda: [0] * len(PERIODS))
-    wild: list[int] = field(default_factory=lambda: [0] * len(PERIODS))
+    span: float = 0.0
+    turns: list[Turns] = field(default_factory=list)
     source: str = ""
     run: int = 0
     at_start: bool = True
@@ -78,6 +116,7 @@ class ColumnFacts:
     def begin(self, source: str = "") -> None:
         """Say that the next cells are of another recording."""
         self.recordings += 1
+        self.turns.append(Turns())
         self.source, self.run, self.at_start, self.last = source, 0, True, math.nan
 
     def leap(self) -> None:
@@ -87,30 +126,47 @@ class ColumnFacts:
     def add(self, cells: Column, start: int = 0) -> None:
         """Take the next cells of the recording, from some row on."""
         numbers = cells
+        self.cells += len(cells)
         if cells.dtype.kind == "U":
             numbers, words = mixed(cells)
-            if words.any():
-                first = int(words.argmax())
-                place = 0, start + first, str(cells[first])
-                count, row, word = self.words.get(self.source, place)
-                self.words[self.source] = (count + int(words.sum()), row, word)
+            self._except(TEXT, words, cells, start)
             if 2 * words.sum() >= len(cells) - (np.isnan(numbers) & ~words).sum():
                 absent = np.strings.str_len(cells) == 0
-                self.cells += len(cells)
                 self._count_missing(absent)
                 self._count_values(cells[~absent])
                 return
             self._count_values(cells[words])
-        absent = np.isnan(numbers)
-        self.cells += len(cells)
+        absent = ~np.isfinite(numbers)
         self._count_missing(absent)
-        present = numbers[~absent]
+        present = numbers
+        if absent.any():
+            present = numbers[~absent]
+            self._except(_INFINITE, np.isinf(numbers), cells, start)
+        if not len(present):
+            return
         self._count_values(present)
-        if len(present):
-            self.numbers.add(present)
-            self._count_steps(present)
+        self.numbers.add(present)
+        if self._count_steps(present):
+            away = np.abs(numbers - np.median(present))
+            usual = np.median(away[~absent])
+            beyond = ~absent & (away > _FAR * usual)
+            if usual > 0 and beyond.sum() <= 1 + len(present) // 100:
+                self._except(_BEYOND, beyond, cells, start)
+
+    def _except(self, reason: str, cells: NDArray[np.bool_], values: Column, start: int) -> None:
+        """Keep how many cells of the recording are no such values as the others, and the first."""
+        if not cells.any():
+            return
+        first = int(cells.argmax())
+        place = 0, start + first, f"{values[first]!s:.60}"
+        count, row, text = self.exceptions.get((reason, self.source), place)
+        self.exceptions[reason, self.source] = (count + int(cells.sum()), row, text)
 
     def _count_missing(self, absent: NDArray[np.bool_]) -> None:
+        if not absent.any():
+            self.longest = max(self.longest, 0 if self.at_start else self.run)
+            self.run, self.at_start = 0, self.at_start and not len(absent)
+            return
         self.missing += int(absent.sum())
         for start, stop in runs_of(absent):
             length = stop - start + (self.run if start == 0 else 0)
@@ -133,25 +189,49 @@ class ColumnFacts:
                     return
         self.values = None
 
-    def _count_steps(self, numbers: NDArray[np.float64]) -> None:
+    def _count_steps(self, numbers: NDArray[np.float64]) -> bool:
+        """Count steps by their sizes; tell whether one is much larger than the others."""
         joined = numbers if math.isnan(self.last) else np.append(self.last, numbers)
         with np.errstate(all="ignore"):
             steps = np.diff(joined)
         self.last = float(numbers[-1])
         self.steps += len(steps)
-        self.falls += int((steps < 0).sum())
-        self.rises += int((steps > 0).sum())
+        span = self.numbers.high - self.numbers.low
+        if span > 1.2 * self.span:  # what seemed to be jumps was none
+            self.span = span
+            for turns in self.turns:
+                turns.moved += turns.jumped
+                turns.jumps, turns.wild, turns.jumped, turns.size = 0, 0, 0.0, 0.0
+        if not len(steps) or not 0 < span < np.inf:
+            return False
+        least, largest = steps.min(), steps.max()
+        self.falls += int((steps < 0).sum()) if least < 0 else 0
+        self.rises += int((steps > 0).sum()) if largest > 0 else 0
+        turns, moved = self.turns[-1], float(joined[-1] - joined[0])
+        if max(largest, -least) <= span / 8:
+            turns.moved += moved
+            turns.counts = turns.counts and least == largest == 1
+            return False
         sizes = np.abs(steps)
-        for i, period in enumerate(PERIODS):
-            jumps = np.abs(sizes - period) < 0.08 * period
-            self.jumps[i] += int(jumps.sum())
-            self.wild[i] += int((sizes > period / 8).sum() - jumps.sum())
+        jumps = sizes > _JUMP * span
+        jumped, others = steps[jumps], steps[~jumps]
+        turns.jumps += len(jumped)
+        turns.jumped += float(jumped.sum())
+        turns.size += float(sizes[jumps].sum())
+        turns.moved += moved - float(jumped.sum())
+        turns.wild += int((sizes > span / 8).sum()) - len(jumped)
+        turns.counts = turns.counts and bool((others == 1).all())
+        return bool(max(largest, -least) > 0.2 * sizes.sum())
 
     @property
     def text(self) -> bool:
         """True if at least half of the cells with a value are text."""
-        words = sum(count for count, *_ in self.words.values())
-        return words > 0 and words >= self.numbers.count
+        return self.words > 0 and self.words >= self.numbers.count
+
+    @property
+    def words(self) -> int:
+        """Number of cells that are text."""
+        return sum(n for (reason, _), (n, *_) in self.exceptions.items() if reason == TEXT)
 
     @property
     def empty(self) -> bool:
@@ -171,7 +251,10 @@ class ColumnFacts:
     @property
     def counter(self) -> bool:
         """True if the numbers rise from nearly every row to the next and never fall."""
-        return not self.text and self.steps > FEW and not self.falls and self.rises > self.steps / 2
+        if self.text or self.steps <= FEW or self.rises <= self.steps / 2:
+            return False
+        begins_anew = self.period and all(turns.counts for turns in self.turns)
+        return bool(not self.falls or begins_anew)
 
     @property
     def set_point(self) -> bool:
@@ -180,16 +263,37 @@ class ColumnFacts:
         return several and not self.rises + self.falls and not self.text
 
     @property
-    def wraps(self) -> float:
-        """The full turn by which an angle jumps, of `PERIODS`; 0 for what is no such angle.
+    def period(self) -> float:
+        """The period after which it begins anew; 0 for what does not.
 
-        It jumps by nearly a full turn, and moves slowly otherwise.
+        It jumps by nearly a period, and moves slowly otherwise: through the whole range, unless the
+        period is a usual one.
         """
-        for i, period in enumerate(PERIODS):
-            turn = 0.9 * period < self.numbers.high - self.numbers.low < 2.1 * period
-            if turn and self.jumps[i] and self.wild[i] <= self.jumps[i] and not self.flag:
+        if self.flag or self.text or not self.turns:
+            return 0.0
+        jumping = [turns for turns in self.turns if turns.jumps]
+        jumps = sum(turns.jumps for turns in jumping)
+        if not jumps or sum(turns.wild for turns in self.turns) > jumps:
+            return 0.0
+        jump = sum(turns.size for turns in jumping) / jumps
+        slow = sum(abs(turns.moved) for turns in self.turns) / max(1, self.steps)
+        span = self.numbers.high - self.numbers.low
+        for period in _PERIODS[:2]:
+            if abs(jump - period) < 0.08 * period and 0.9 * period < span < 1.3 * period:
                 return period
-        return 0.0
+        if jump < 0.8 * span:
+            return 0.0
+        # From the end to the beginning and through the range again, not to and fro.
+        least = 0.3 * span
+        through = [t for t in jumping if abs(t.jumped) > 0.6 * t.size and t.jumped * t.moved < 0]
+        if 2 * sum(abs(turns.moved) > least for turns in through) < len(jumping):
+            return 0.0
+        powers = [2.0**k for k in range(4, 33)] + [10.0**k for k in range(-3, 10)]
+        least, likely, most = max(span, jump), max(span, jump + slow), max(span, jump) + 3 * slow
+        usual = [p for p in (*_PERIODS, *powers) if 0.999 * least <= p <= 1.01 * most]
+        rounded = [float(f"{likely:.{digits}g}") for digits in range(1, 6)]
+        near = [p for p in rounded if abs(p / likely - 1) < _NEAR]
+        return float([*usual, *near, likely][0])
 
     @property
     def coarse(self) -> bool:
@@ -207,74 +311,88 @@ class ClockFacts:
     ----------
     steps
         Times between rows in the unit of the stamps.
-    dated
-        Whether the stamps are texts such as ``2024-05-01 12:00:00``; then the unit is a second.
+    unit
+        ``"date"`` of texts, ``"s"`` of seconds and nanoseconds; empty where it is to be guessed.
     largest, whole
-        The largest stamp, and whether all are whole numbers: they tell the unit.
+        The largest stamp, and whether all are whole numbers.
+    by_order
+        The same by order of day and month, of dates that need one, the likelier first.
     """
 
     steps: Steps
-    dated: bool
+    unit: str
     largest: float
     whole: bool
+    by_order: Mapping[str, "ClockFacts"] = field(default_factory=dict)
 
     @classmethod
-    def of(
-        cls, blocks: Sequence[tuple[int, NDArray[np.float64]]], *, dated: bool = False
-    ) -> "ClockFacts | None":
+    def of(cls, rows: NDArray[np.int64], columns: Sequence[Column]) -> "ClockFacts | None":
         """Return the facts of one recording's stamps; None where no two rows have one.
 
         Parameters
         ----------
-        blocks
-            First row, and stamps, of blocks of rows; NaN where one is missing.
-        dated
-            Whether they were texts.
+        rows
+            Numbers of the rows.
+        columns
+            One column of numbers or texts, NaN or empty where one is missing, or two whose times
+            add up: date and time of day, or seconds and nanoseconds.
+
+        Raises
+        ------
+        TrajectoryError
+            When a text is no time.
         """
-        present = [(first + np.flatnonzero(~np.isnan(x)), x[~np.isnan(x)]) for first, x in blocks]
-        rows = np.concatenate([np.zeros(0, np.int64), *(numbers for numbers, _ in present)])
-        times = np.concatenate([np.zeros(0), *(stamps for _, stamps in present)])
-        if len(times) < 2:
-            return None
-        steps, all_whole = Steps.of(times, rows), bool((times == np.round(times)).all())
-        return cls(steps, dated, float(np.abs(times).max()), all_whole)
+        dated = columns[0].dtype.kind == "U"
+        orders = [order for cells in columns if dated for order in orders_of(cells)]
+        units = ("", "") if dated or len(columns) == 1 else ("s", "ns")
+        unit = "date" if dated else units[0]
+        readings: dict[str, ClockFacts] = {}
+        for order in orders or [""]:
+            seconds = [
+                parse_times(cells, of_column, order)
+                for cells, of_column in zip(columns, units, strict=False)
+            ]
+            times = np.sum(seconds, axis=0)
+            present = np.isfinite(times)
+            times = times[present]
+            if len(times) < 2:
+                return None
+            steps, whole = Steps.of(times, rows[present]), bool((times == np.round(times)).all())
+            readings[order] = cls(steps, unit, float(np.abs(times).max()), whole)
+        return replace(readings[orders[0]], by_order=readings) if orders else readings[""]
 
 
 def time_unit(name: str, clocks: Sequence[ClockFacts]) -> str:
-    """Return the unit of stamps: ``"date"``, ``"s"``, ``"ms"``, ``"us"`` or ``"ns"``.
+    """Return the unit of stamps: ``"date"``, or one from ``"ns"`` to ``"d"``.
 
     The name decides where it has a unit, then the size of stamps since 1970, then whether whole
-    numbers are far apart.
+    numbers are far apart, or steps are whole seconds in hours or days.
 
     Examples
     --------
-    >>> rows = [ClockFacts(Steps.of(np.array([0.0, 15.0])), False, 9900.0, True)]
-    >>> time_unit("Time", rows), time_unit("t[s]", rows)
-    ('ms', 's')
+    >>> rows = [ClockFacts(Steps.of(np.array([0.0, 15.0])), "", 9900.0, True)]
+    >>> time_unit("Time", rows), time_unit("t[s]", rows), time_unit("t (min)", rows)
+    ('ms', 's', 'min')
     """
-    if any(clock.dated for clock in clocks):
-        return "date"
-    if match := re.search(r"(?:[^a-zA-Zµ]|^)([nuµm]s|[nu]sec|msec|sec|s)\W*$", name.strip()):
-        return match[1].replace("µ", "u").replace("sec", "s")
+    if unit := next((clock.unit for clock in clocks if clock.unit), "") or unit_in(name):
+        return unit
     largest = max(clock.largest for clock in clocks)
     for unit, least in (("ns", 1e17), ("us", 1e14), ("ms", 1e11)):
         if largest > least:
             return unit
-    steps = [clock.steps.usual for clock in clocks]
-    far = 1 < float(np.median(steps)) < 10_000 and all(clock.whole for clock in clocks)
+    step = float(np.median([clock.steps.usual for clock in clocks]))
+    # Days since 1900 or the year 0, as spreadsheets and MATLAB count them.
+    if step < 0.01 and (2e4 < largest < 1e5 or 6e5 < largest < 1e6):
+        return "d"
+    for unit, most in (("d", 2e-5), ("h", 4e-4)):
+        seconds = step * SCALES[unit]
+        if 0 < step < most and _is_round(seconds) and not _is_round(step):
+            return unit
+    far = 1 < step < 10_000 and all(clock.whole for clock in clocks)
     return "ms" if far else "s"
 
 
-def parse_dates(texts: Column) -> NDArray[np.float64] | None:
-    """Return stamps in seconds, NaN for empty texts; None when any is no time in ISO 8601.
-
-    Examples
-    --------
-    >>> parse_dates(np.array(["1970-01-01 00:00:01", "1970-01-01T00:00:01.250Z", ""]))
-    array([1.  , 1.25,  nan])
-    >>> parse_dates(np.array(["open", "closed"])) is None
-    True
-    """
-    with contextlib.suppress(TrajectoryError):
-        return parse_times(texts, "iso")
-    return None
+def _is_round(step: float) -> bool:
+    """Tell whether a step, or the rate that it makes, has one digit, as people choose them."""
+    digits = [x / 10.0 ** math.floor(math.log10(x)) for x in (step, 1 / step)]
+    return any(abs(x - round(2 * x) / 2) < 2e-3 * x for x in digits)

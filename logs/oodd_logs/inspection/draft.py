@@ -163,7 +163,7 @@ def _draft_columns(logs: Inspection) -> Iterator[str]:
     facts = {name: logs.columns[name] for name in sensors}
     if flags := [name for name in sensors if facts[name].flag]:
         yield f"# flags among them, which may be labels by other names: {listed(flags)}"
-    if angles := [name for name in sensors if facts[name].wraps]:
+    if angles := [name for name in sensors if facts[name].period]:
         yield f"angles = {toml([*map(bare_name, angles)])}  # become sine and cosine"
     if any(lacks_values(name, facts[name]) for name in sensors):
         most = max(max(column.longest, column.leading) for column in facts.values())

@@ -1,5 +1,6 @@
 """Contents of logs: recordings, their columns and clocks, and files that are not as the others."""
 
+import contextlib
 import hashlib
 import re
 from collections import Counter, defaultdict
@@ -14,11 +15,13 @@ from numpy.typing import NDArray
 from oodd_eval.data.files import lies_in
 from oodd_eval.errors import TrajectoryError, UsageError
 from oodd_eval.names import check_known
-from oodd_logs.inspection.columns import FEW, ClockFacts, ColumnFacts, parse_dates, time_unit
+from oodd_logs.inspection.columns import EXCEPTIONS, FEW, ClockFacts, ColumnFacts, time_unit
 from oodd_logs.inspection.episode_keys import episode_columns
+from oodd_logs.kinds.times import names_time, pairs_of, parse_times, unit_of
 from oodd_logs.ledger import Ledger
 from oodd_logs.readers import NO_OPTIONS, Options, Reader, in_order, readers
 from oodd_logs.recording import Column, Recording, Topic
+from oodd_logs.selecting import split_unit
 from oodd_logs.splitting import split_recording
 
 _CELLS: Final = 1 << 20  # of the rows that are in memory at once
@@ -29,13 +32,11 @@ _FIRST: Final = 8  # columns of which the first row may count like a clock
 _ENDS: Final = 2000  # rows at either end of a recording that are compared with others
 _OVERLAP: Final = 20  # rows that two recordings have to share
 _PRIME: Final = np.uint64(0x100000001B3)
-_TIME: Final = re.compile(
-    r"(?:^|[^a-z])(?:time|timestamp|datetime|date|stamp|ts|t)(?:$|[^a-z])", re.IGNORECASE
-)
 _LABEL: Final = re.compile(
     r"anomal|fault|fail|label|health|attack|alarm|error|class|status|stop|lost|binary",
     re.IGNORECASE,
 )
+_DAY: Final = 86400  # seconds
 _INTERVALS: Final = ({"file", "start"}, {"file", "onset"})
 
 
@@ -57,6 +58,8 @@ class RecordingFacts:
         Facts of the columns that may have times, by name.
     stamps
         Columns that the format defines to be times in seconds.
+    added
+        Columns whose times are added to those of others, such as times of day, by these.
     values
         Cells by value, of each column with few values.
     fields
@@ -74,6 +77,7 @@ class RecordingFacts:
     columns: tuple[str, ...]
     clocks: Mapping[str, ClockFacts]
     stamps: frozenset[str]
+    added: Mapping[str, str]
     values: Mapping[str, Mapping[float | str, int]]
     fields: Mapping[str, Any]
     digest: str
@@ -149,7 +153,9 @@ class Inspection:
 
     def clocks(self, name: str) -> list[tuple[RecordingFacts, ClockFacts]]:
         """Return the recordings in which a column may have times, with facts of these."""
-        return [(r, r.clocks[name]) for r in self.recordings if name in r.clocks]
+        order = self.date_order
+        clocks = ((r, r.clocks[name]) for r in self.recordings if name in r.clocks)
+        return [(r, clock.by_order.get(order, clock)) for r, clock in clocks]
 
     @property
     def times(self) -> dict[str, str]:
@@ -167,6 +173,23 @@ class Inspection:
                 time_columns[topic], best[topic] = name, share
         clocks = {name: [clock for _, clock in self.clocks(name)] for name in time_columns.values()}
         return {n: "s" if n in self.stamps else time_unit(n, c) for n, c in clocks.items()}
+
+    @property
+    def added(self) -> dict[str, str]:
+        """Columns whose times are added to those of others, by these."""
+        return {name: more for r in self.recordings for name, more in r.added.items()}
+
+    @property
+    def date_order(self) -> str:
+        """Which of day and month comes first in dates; empty where none needs that.
+
+        All cells tell; where they leave both, the one that makes the shortest steps, else the
+        likelier.
+        """
+        readings = [c.by_order for r in self.recordings for c in r.clocks.values() if c.by_order]
+        orders = [o for o in (readings or [{}])[0] if all(o in other for other in readings)]
+        longest = {o: max(clocks[o].steps.longest for clocks in readings) for o in orders}
+        return min(orders, key=lambda order: longest[order], default="")
 
     @property
     def stamps(self) -> frozenset[str]:
@@ -199,6 +222,7 @@ class Inspection:
         columns: dict[str, ColumnFacts] = {}
         before: dict[str, Counter[float | str]] = {}
         clocks: dict[str, ClockFacts] = {}
+        added: dict[str, str] = {}
         digest = hashlib.sha256()
         head = tail = np.empty(0, np.uint64)
         topics = recording.topics.items()
@@ -208,16 +232,16 @@ class Inspection:
                 columns[name] = self.columns.setdefault(name, ColumnFacts())
                 before[name] = Counter(columns[name].values or {})
                 columns[name].begin(source)
-            stamps: dict[str, list[tuple[int, NDArray[np.float64]]]] = {}
-            dated: dict[str, bool] = {}
+            likely: list[tuple[str, ...]] = []
+            stamps: dict[str, list[Column]] = {}
+            numbered: list[NDArray[np.int64]] = []
             hashed: list[str] = []
             following = 0
             for start, block in _blocks(topic):
                 if not start:
-                    likely = [name for name in block if _may_be_time(topic, name, block[name])]
-                    stamps = {name: [] for name in likely}
-                    dated = {name: block[name].dtype.kind == "U" for name in likely}
-                    numbers = (n for n in block if block[n].dtype.kind == "f" and n not in likely)
+                    likely = _time_columns(topic, block)
+                    stamps = {name: [] for names in likely for name in names}
+                    numbers = (n for n in block if block[n].dtype.kind == "f" and n not in stamps)
                     hashed = sorted(n for n in numbers if len(np.unique(block[n][:1000])) > FEW)
                 rows = np.zeros(len(next(iter(block.values()))) if hashed else 0, np.uint64)
                 for name, cells in block.items():
@@ -230,15 +254,15 @@ class Inspection:
                 head = np.append(head, rows[: _ENDS - len(head)])
                 tail = np.append(tail, rows)[-_ENDS:]
                 following = start + len(next(iter(block.values())))
-                for name in [*stamps]:
-                    times = parse_dates(block[name]) if dated[name] else block[name]
-                    if times is None or times.dtype.kind == "U":
-                        del stamps[name]
-                    else:
-                        stamps[name].append((start, times))
-            for name, blocks in stamps.items():
-                if clock := ClockFacts.of(blocks, dated=dated[name]):
-                    clocks[f"{below}{name}"] = clock
+                numbered.append(np.arange(start, following))
+                for name in stamps:
+                    stamps[name].append(block[name])
+            for names in likely:
+                columns_of = [np.concatenate(stamps[name]) for name in names]
+                with contextlib.suppress(TrajectoryError):
+                    if clock := ClockFacts.of(np.concatenate(numbered), columns_of):
+                        clocks[f"{below}{names[0]}"] = clock
+                        added |= {f"{below}{names[0]}": f"{below}{name}" for name in names[1:]}
         self.ledger.merge(recording.ledger, source)
         self.recordings.append(
             RecordingFacts(
@@ -249,6 +273,7 @@ class Inspection:
                 tuple(columns),
                 clocks,
                 frozenset(f"{n}.{t.time}" if n else t.time for n, t in topics if t.time),
+                added,
                 {name: c.values - before[name] for name, c in columns.items() if c.values},
                 dict(recording.fields),
                 digest.hexdigest(),
@@ -349,9 +374,9 @@ def inspect_logs(
     result.shared = {file: n for file, n in shared.items() if file not in equal}
     result.continued = _continued(result.recordings)
     for name in [n for n, c in result.columns.items() if not c.text and n not in result.labels]:
-        for source, (count, row, cell) in result.columns[name].words.items():
+        for (reason, source), (count, row, cell) in result.columns[name].exceptions.items():
             values: dict[str, Any] = {"name": name, "count": count, "source": source, "row": row}
-            result.ledger.add("cell", "held", "text among numbers", cell=cell, **values)
+            result.ledger.add("cell", EXCEPTIONS[reason], reason, cell=cell, **values)
     return result
 
 
@@ -465,10 +490,29 @@ def _first_row_counts(topic: Topic) -> bool:
     return bool(steps[0] > 0 and np.allclose(steps, steps[0], rtol=1e-3))
 
 
+def _time_columns(topic: Topic, block: Mapping[str, Column]) -> list[tuple[str, ...]]:
+    """Return columns that may have times of rows, and pairs of columns whose times add up."""
+    texts: dict[str, str] = {}
+    for name, cells in block.items():
+        if cells.dtype.kind == "U" and len(cells) and cells[0]:
+            with contextlib.suppress(TrajectoryError):
+                seconds = parse_times(cells[:3], "", "day first")
+                texts[name] = "date" if not (seconds % 86400).any() else "moment"
+                if ":" in cells[0] and np.nanmax(np.abs(seconds)) < _DAY:
+                    texts[name] = "time of day"
+    pairs = pairs_of(topic.names) if not topic.time else {}
+    dates, times = ([n for n in texts if texts[n] == kind] for kind in ("date", "time of day"))
+    pairs |= dict(zip(dates[:1], times[:1], strict=False))
+    plain = [*texts, *(name for name in block if _may_be_time(topic, name, block[name]))]
+    single = [(name,) for name in plain if name not in {*pairs, *pairs.values()}]
+    return [*pairs.items(), *single]
+
+
 def _may_be_time(topic: Topic, name: str, cells: Column) -> bool:
-    if cells.dtype.kind == "U":
-        return bool(cells[0]) and parse_dates(cells[:3]) is not None
-    return name == topic.time if topic.time else bool(_TIME.search(name))
+    if cells.dtype.kind == "U" or topic.time:
+        return name == topic.time
+    unit = split_unit(name)[1]
+    return names_time(name) and (not unit or bool(unit_of(unit)))
 
 
 def _blocks(topic: Topic) -> Iterator[tuple[int, dict[str, Column]]]:

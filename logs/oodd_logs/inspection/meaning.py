@@ -15,11 +15,9 @@ import numpy as np
 from oodd_eval.data.facts import ANOMALIES
 from oodd_logs.inspection.columns import ColumnFacts
 from oodd_logs.inspection.logs import Inspection, RecordingFacts
+from oodd_logs.kinds.times import SCALES
 from oodd_logs.selecting import split_unit
 from oodd_logs.stamps import GAP_STEPS
-
-SCALES: Final = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0, "date": 1.0}
-"""Seconds in the units of stamps."""
 
 NOMINAL_WORDS: Final = re.compile(
     r"(?:^|[^a-z])(?:nominal|normal|healthy|good|free|baseline|reference|no[^a-z]?(?:fault|failure|anomal\w*))"

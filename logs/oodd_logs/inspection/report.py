@@ -14,7 +14,6 @@ from oodd_eval.names import counted, listed
 from oodd_logs.inspection.logs import READ_ROWS, Inspection
 from oodd_logs.inspection.meaning import (
     ENOUGH,
-    SCALES,
     anomalous_rows,
     bare_name,
     cuts_of,
@@ -31,18 +30,12 @@ from oodd_logs.inspection.meaning import (
     step_of,
     window_of,
 )
+from oodd_logs.kinds.times import SCALES, UNIT_NAMES
 from oodd_logs.readers import quantity
 from oodd_logs.recipe import MISSING_ROWS
 from oodd_logs.stamps import GAP_STEPS
 
 _MANY: Final = 60  # columns beyond which the table has only those that look like something
-_UNITS: Final = {
-    "date": "dates",
-    "s": "seconds",
-    "ms": "milliseconds",
-    "us": "microseconds",
-    "ns": "nanoseconds",
-}
 
 
 class Advice(NamedTuple):
@@ -157,7 +150,7 @@ def _of_times(logs: Inspection) -> Iterator[Advice]:
     suffix = "" if unit in {"date", "s"} else f"[{unit}]"
     keys = [] if name in logs.stamps else [f'time = "{name}{suffix}"']
     keys += [f"rate = {rate}"] if step > 0 else []
-    yield _say("time", name=name, unit=_UNITS[unit], step=number(step), keys=", ".join(keys))
+    yield _say("time", name=name, unit=UNIT_NAMES[unit], step=number(step), keys=", ".join(keys))
     rates = [(r, clock.steps.usual * SCALES[unit]) for r, clock in clocks]
     if other_rates := [(r.file, other) for r, other in rates if abs(other - step) > 0.1 * step]:
         steps = listed(sorted({number(other) for _, other in other_rates}))
@@ -194,7 +187,7 @@ def _of_columns(logs: Inspection) -> Iterator[Advice]:
         )
     if flags := [name for name, c in plain.items() if c.flag]:
         yield _say("flags", names=listed(flags))
-    if angles := [name for name, c in plain.items() if c.wraps]:
+    if angles := [name for name, c in plain.items() if c.period]:
         yield _say("angles", names=listed(angles), bare=toml([*map(bare_name, angles)]))
     if coarse := [name for name, c in plain.items() if c.coarse]:
         spread, mean = plain[coarse[0]].numbers.spread, plain[coarse[0]].numbers.mean
@@ -241,7 +234,7 @@ def looks_like(logs: Inspection) -> dict[str, str]:
         values = [] if facts.values is None else sorted(facts.values, key=str)
         texts = ", ".join(v if isinstance(v, str) else number(v) for v in values)
         by_role = {
-            "times": f"time ({_UNITS.get(times.get(name, ''))})",
+            "times": f"time ({UNIT_NAMES.get(times.get(name, ''), '')})",
             "labels": f"label? {texts}",
             "text": f"text: {texts}" if values else "text, many values",
             "counters": "counter: never falls",
@@ -252,8 +245,8 @@ def looks_like(logs: Inspection) -> dict[str, str]:
             return by_role[roles[name]]
         if facts.flag:
             return f"flag: {texts}"
-        if facts.wraps:
-            return f"angle that wraps at {number(facts.wraps)}"
+        if facts.period:
+            return f"angle that wraps at {number(facts.period)}"
         return "float32 is too coarse" if facts.coarse else ""
 
     return {name: looks(name) for name in logs.columns}

@@ -61,15 +61,18 @@ class Kind:
         for which the ledger has them; nothing is said for empty ones.
     key
         Key of recipes that lists columns of the kind; empty where a recipe says nothing of them.
+    sensor
+        Whether columns of the kind are sensors of a first recipe.
     recognise
         Called with facts of columns by name (`oodd_logs.inspection.columns.ColumnFacts`); returns
-        the value that `key` would have in a recipe, by names of columns: a tuple of several where
-        they belong together. None where it is not told by numbers.
+        by name, or a tuple of the names that belong together, a number, which the key has for it
+        in a table, or None, and the key is a list; a text is said, but is not in the recipe.
     check
         Called with what messages call the key and its value in a recipe; returns the value, or
         raises `UsageError` with what is expected.
     convert
-        Called with the value of the key and the sensors; returns its conversions.
+        Called with the value of the key and the sensors; returns its conversions, none of whose
+        inputs those of another are.
     read
         Called with texts of a column that are no numbers; returns the numbers of those that the
         kind knows, by their text, NaN for what is missing.
@@ -82,9 +85,10 @@ class Kind:
     name: str
     words: str
     key: str = ""
+    sensor: bool = True
     recognise: Callable[[Mapping[str, Any]], Mapping[str | tuple[str, ...], Any]] | None = None
     check: Callable[[str, Any], Any] | None = None
-    convert: Callable[[Any, Sequence[Quantity]], Sequence[Conversion]] | None = None
+    convert: Callable[[Any, Sequence[Quantity]], Iterable[Conversion]] | None = None
     read: Callable[[Sequence[str]], Mapping[str, float]] | None = None
     flatten: Callable[[str, Any], Iterable[tuple[str, Any]] | None] | None = None
 
