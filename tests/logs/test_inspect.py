@@ -355,7 +355,7 @@ def test_a_file_that_cannot_be_read_is_reported_beside_the_others(clean):
     remarks = topics(logs)
     assert ".pdf" in remarks["others"]
     assert "run-2.csv" in remarks["unreadable"]
-    assert "left out, as they cannot be read: run-2.csv" in draft(logs)
+    assert "have no rows: run-2.csv" in draft(logs)
     patterns = draft_recipe(clean).nominal.files
     matched = {path.name for pattern in patterns for path in clean.glob(pattern)}
     assert matched == {f"run-{i}.csv" for i in range(40) if i != 2}

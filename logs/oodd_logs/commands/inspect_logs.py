@@ -14,8 +14,8 @@ from oodd_eval.prose import print_prose
 from oodd_logs.commands.reader_plugins import register_formats
 from oodd_logs.inspection.draft import draft
 from oodd_logs.inspection.logs import Inspection, inspect_logs, refuse_logs
-from oodd_logs.inspection.meaning import sensors_of, window_of
-from oodd_logs.inspection.report import describe_logs
+from oodd_logs.inspection.meaning import window_of
+from oodd_logs.inspection.report import as_json, describe_logs
 from oodd_logs.scanning.limits import FITS, SHORTEST, WINDOWS
 from oodd_logs.scanning.outliers import LEAST
 
@@ -34,6 +34,7 @@ _NO_SENSOR: Final = (
 )
 @click.argument("path", type=FILE)
 @click.option("--recipe", type=OUTPUT_FILE, help="write a first recipe there, for `data import`")
+@click.option("--json", type=OUTPUT_FILE, help="write everything as JSON")
 @click.option("--format", metavar="NAME", help="of the files (default: by their endings)")
 @click.option(
     "--read", multiple=True, type=PARAMETER, help="an option of the format; V is JSON or text"
@@ -48,7 +49,7 @@ def inspect(options: Options) -> int:
     console = make_console(quiet=options.verbosity < 0)
     if options.recipe and options.recipe.exists():
         raise OutputError(f"{str(options.recipe)!r} exists: remove it, or choose another name")
-    refuse_logs([options.recipe], options.path, options.format)
+    refuse_logs([options.recipe, options.json], options.path, options.format)
     logs = inspect_logs(
         options.path,
         options.format or "",
@@ -56,8 +57,10 @@ def inspect(options: Options) -> int:
         lambda file: console.print(file) if options.verbosity > 0 else None,
     )
     console.print(describe_logs(logs, console.width))
+    if options.json:
+        write_text(options.json, json.dumps(as_json(logs), indent=2) + "\n")
     console.print("")
-    sensors = sensors_of(logs)
+    sensors = logs.sensors
     if not sensors:
         print_prose(_NO_SENSOR, console)
     elif scan := _scan(options, logs):

@@ -5,6 +5,7 @@ properties say what it looks like: a constant, a flag, a counter, an angle that 
 float32 cannot tell apart.
 """
 
+import contextlib
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oodd_eval.data.offsets import RunningMoments, is_coarse
+from oodd_eval.errors import TrajectoryError
 from oodd_logs.kinds.times import SCALES, orders_of, parse_times, unit_in
 from oodd_logs.ledger import Fate
 from oodd_logs.marks import runs_of
@@ -396,3 +398,18 @@ def _is_round(step: float) -> bool:
     """Tell whether a step, or the rate that it makes, has one digit, as people choose them."""
     digits = [x / 10.0 ** math.floor(math.log10(x)) for x in (step, 1 / step)]
     return any(abs(x - round(2 * x) / 2) < 2e-3 * x for x in digits)
+
+
+def parse_dates(texts: Column) -> NDArray[np.float64] | None:
+    """Return stamps in seconds, NaN for empty texts; None when any is no time.
+
+    Examples
+    --------
+    >>> parse_dates(np.array(["1970-01-01 00:00:01", "01/01/1970 0:00:01.250", ""]))
+    array([1.  , 1.25,  nan])
+    >>> parse_dates(np.array(["open", "closed"])) is None
+    True
+    """
+    with contextlib.suppress(TrajectoryError):
+        return parse_times(texts, "iso", next(iter(orders_of(texts)), ""))
+    return None

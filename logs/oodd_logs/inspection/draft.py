@@ -5,16 +5,15 @@ import glob
 import re
 import textwrap
 import tomllib
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Final
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS
 from oodd_eval.names import listed
 from oodd_logs.inspection.logs import Inspection, inspect_logs
 from oodd_logs.inspection.meaning import (
     NOMINAL_WORDS,
-    bare_name,
     cuts_of,
     fields_of,
     gap_of,
@@ -24,26 +23,14 @@ from oodd_logs.inspection.meaning import (
     name_of,
     nominal_values,
     rate_of,
-    roles_of,
-    sensors_of,
     sort_files,
-    usable_files,
     window_of,
 )
-from oodd_logs.inspection.report import number, toml
+from oodd_logs.inspection.report import number, time_lines
+from oodd_logs.inspection.roles import line_of, role_of, toml
+from oodd_logs.kinds import kinds
 from oodd_logs.readers import NO_OPTIONS, Options
 from oodd_logs.recipe import MISSING_ROWS, Recipe
-
-_REASONS: Final = {
-    "times and counters": {"times", "counters"},
-    "labels": {"labels"},
-    "constant or empty": {"empty", "constant"},
-    "constant in each recording": {"setpoints"},
-    "text": {"text"},
-    "not in all files": {"partial"},
-    "in topics with few rows": {"slow"},
-}
-"""Roles of columns that are no sensors, by the reason in a remark of the recipe."""
 
 
 def draft_recipe(path: Path, form: str = "", options: Options = NO_OPTIONS) -> Recipe:
@@ -121,9 +108,7 @@ def _draft_rows(logs: Inspection) -> Iterator[str]:
         yield f"episode = {toml(columns)}  # tells the episodes of a file apart"
     if len(times) == 1 and len(logs.topics) == 1:
         ((name, unit),) = times.items()
-        suffix = "" if unit in {"date", "s"} or "[" in name else f"[{unit}]"
-        if name not in logs.stamps:
-            yield f"time = {toml(f'{name}{suffix}')}"
+        yield from time_lines(logs, name, unit)
     if times:
         yield f"rate = {rate_of(logs)}  # rows in a second"
     else:
@@ -147,24 +132,28 @@ def _draft_rows(logs: Inspection) -> Iterator[str]:
 
 def _draft_columns(logs: Inspection) -> Iterator[str]:
     """Yield the sensors and what becomes of them."""
-    sensors = sensors_of(logs)
+    sensors, remarks = logs.sensors, defaultdict(list)
+    wrapper = textwrap.TextWrapper(98, initial_indent="# ", subsequent_indent="#   ")
     if any(name.startswith("obs:") for name in sensors):
         yield "# sensors and actions are the columns obs:NAME[UNIT] and action:NAME[UNIT]"
     else:
-        roles = roles_of(logs)
         yield "sensors = ["
         yield from (f"  {toml(name)}," for name in sensors)
         yield "]"
         yield '# actions = ["cmd*"]  # what was commanded, if columns say so'
-        wrapper = textwrap.TextWrapper(98, initial_indent="# ", subsequent_indent="#   ")
-        for reason, excluded in _REASONS.items():
-            if names := [name for name, role in roles.items() if role in excluded]:
-                yield from wrapper.wrap(f"left out, {reason}: {listed(names, 40)}")
+        for name, role in logs.roles.items():
+            if role:
+                remarks[role_of(role).reason].append(name)
+        for reason, names in remarks.items():
+            yield from wrapper.wrap(f"left out, {reason}: {listed(names, 40)}")
+    for name, found in logs.kinds.items():
+        kind = kinds()[name]
+        used = {names: value for names, value in found.items() if {*names} <= {*sensors}}
+        if line := line_of(kind, used):
+            yield line
+        elif used:
+            yield from wrapper.wrap(f"{name}: {listed([n for names in used for n in names], 40)}")
     facts = {name: logs.columns[name] for name in sensors}
-    if flags := [name for name in sensors if facts[name].flag]:
-        yield f"# flags among them, which may be labels by other names: {listed(flags)}"
-    if angles := [name for name in sensors if facts[name].period]:
-        yield f"angles = {toml([*map(bare_name, angles)])}  # become sine and cosine"
     if any(lacks_values(name, facts[name]) for name in sensors):
         most = max(max(column.longest, column.leading) for column in facts.values())
         yield 'missing = "hold"  # the last value; or "drop" rows, or "refuse"'
@@ -196,10 +185,10 @@ def _draft_files(logs: Inspection, prefix: str) -> Iterator[str]:
     """Yield the tables that say which files are nominal, and which have which anomaly."""
     sorting = sort_files(logs)
     files = list(dict.fromkeys(r.file for r in logs.recordings))
-    if unusable := [file for file in files if file not in usable_files(logs)]:
+    if unusable := [file for file in files if file not in logs.usable]:
         yield f"# left out, as copies of others or with other columns: {listed(unusable, 40)}"
     if logs.unreadable:
-        yield f"# left out, as they cannot be read: {listed(logs.unreadable, 40)}"
+        yield f"# left out, as they cannot be read or have no rows: {listed(logs.unreadable, 40)}"
         files = list(dict.fromkeys([*files, *logs.unreadable]))
     yield "[nominal]" + (f"  # {sorting.reason}" if sorting.reason else "")
     yield f"files = {_globs(files, sorting.nominal, prefix)}"

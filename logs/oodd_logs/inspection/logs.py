@@ -5,7 +5,8 @@ import hashlib
 import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,18 +15,31 @@ from numpy.typing import NDArray
 
 from oodd_eval.data.files import lies_in
 from oodd_eval.errors import TrajectoryError, UsageError
-from oodd_eval.names import check_known
-from oodd_logs.inspection.columns import EXCEPTIONS, FEW, ClockFacts, ColumnFacts, time_unit
+from oodd_eval.names import check_known, listed
+from oodd_logs.inspection.columns import (
+    EXCEPTIONS,
+    FEW,
+    ClockFacts,
+    ColumnFacts,
+    parse_dates,
+    time_unit,
+)
 from oodd_logs.inspection.episode_keys import episode_columns
-from oodd_logs.kinds.times import names_time, pairs_of, parse_times, unit_of
+from oodd_logs.inspection.roles import Recognised, recognise, role_of
+from oodd_logs.kinds import kinds
+from oodd_logs.kinds.times import UNIT_NAMES, names_time, pairs_of, unit_in, unit_of
 from oodd_logs.ledger import Ledger
 from oodd_logs.readers import NO_OPTIONS, Options, Reader, in_order, readers
 from oodd_logs.recording import Column, Recording, Topic
-from oodd_logs.selecting import split_unit
+from oodd_logs.selecting import plain_name, split_unit
 from oodd_logs.splitting import split_recording
 
 _CELLS: Final = 1 << 20  # of the rows that are in memory at once
 _TABLES: Final = 3  # recordings in which columns are looked for that tell episodes apart
+SLOW: Final = 0.1
+"""Share of the rows of the fullest topic, below which one is left out at first."""
+
+_FEW_FILES: Final = 0.2  # share of the files that are left out where they lack a column
 READ_ROWS: Final = 2_000_000
 """Rows of a topic that are looked at; of a longer one, blocks over all of it."""
 _FIRST: Final = 8  # columns of which the first row may count like a clock
@@ -64,6 +78,8 @@ class RecordingFacts:
         Cells by value, of each column with few values.
     fields
         Values that hold for the whole recording.
+    empty
+        Columns without a number in it.
     digest
         SHA-256 of its rows.
     head, tail
@@ -80,6 +96,7 @@ class RecordingFacts:
     added: Mapping[str, str]
     values: Mapping[str, Mapping[float | str, int]]
     fields: Mapping[str, Any]
+    empty: frozenset[str]
     digest: str
     head: NDArray[np.uint64]
     tail: NDArray[np.uint64]
@@ -89,8 +106,19 @@ class RecordingFacts:
         """Rows of the longest topic."""
         return max(self.rows.values(), default=0)
 
+    def renamed(self, new: Mapping[str, str]) -> "RecordingFacts":
+        """Return the facts with other names of columns."""
+        return replace(
+            self,
+            columns=tuple(new.get(name, name) for name in self.columns),
+            clocks={new.get(name, name): clock for name, clock in self.clocks.items()},
+            added={new.get(name, name): new.get(n, n) for name, n in self.added.items()},
+            values={new.get(name, name): values for name, values in self.values.items()},
+            empty=frozenset(new.get(name, name) for name in self.empty),
+        )
 
-@dataclass(slots=True)
+
+@dataclass(eq=False)
 class Inspection:
     """Contents of logs, and the roles that columns may have.
 
@@ -121,7 +149,7 @@ class Inspection:
     others
         Number of files of other formats, by ending.
     problems, unreadable
-        What could not be read, and the files that it is in.
+        What could not be read, and the files of which nothing is.
     ledger
         What was left out, or is not as in most of the logs.
     """
@@ -141,8 +169,10 @@ class Inspection:
     problems: list[str] = field(default_factory=list)
     unreadable: list[str] = field(default_factory=list)
     ledger: Ledger = field(default_factory=Ledger)
+    _spellings: dict[tuple[str, str], str] = field(default_factory=dict)
+    _written: dict[str, dict[str, list[str]]] = field(default_factory=dict)
 
-    @property
+    @cached_property
     def topics(self) -> tuple[str, ...]:
         """Names of the topics, in their order."""
         return tuple(dict.fromkeys(t for r in self.recordings for t in r.rows))
@@ -157,7 +187,7 @@ class Inspection:
         clocks = ((r, r.clocks[name]) for r in self.recordings if name in r.clocks)
         return [(r, clock.by_order.get(order, clock)) for r, clock in clocks]
 
-    @property
+    @cached_property
     def times(self) -> dict[str, str]:
         """Columns with the times of rows, one a topic, and their units.
 
@@ -174,12 +204,12 @@ class Inspection:
         clocks = {name: [clock for _, clock in self.clocks(name)] for name in time_columns.values()}
         return {n: "s" if n in self.stamps else time_unit(n, c) for n, c in clocks.items()}
 
-    @property
+    @cached_property
     def added(self) -> dict[str, str]:
         """Columns whose times are added to those of others, by these."""
         return {name: more for r in self.recordings for name, more in r.added.items()}
 
-    @property
+    @cached_property
     def date_order(self) -> str:
         """Which of day and month comes first in dates; empty where none needs that.
 
@@ -191,12 +221,12 @@ class Inspection:
         longest = {o: max(clocks[o].steps.longest for clocks in readings) for o in orders}
         return min(orders, key=lambda order: longest[order], default="")
 
-    @property
+    @cached_property
     def stamps(self) -> frozenset[str]:
         """Columns that the format defines to be times in seconds."""
         return frozenset(name for r in self.recordings for name in r.stamps)
 
-    @property
+    @cached_property
     def labels(self) -> tuple[str, ...]:
         """Columns that may say which rows are anomalous, the likeliest first.
 
@@ -215,12 +245,149 @@ class Inspection:
                 candidates.append((len(values) > 2, facts.missing > 0, not facts.text, name))
         return tuple(name for *_, name in sorted(candidates, key=lambda row: row[:-1]))
 
+    @cached_property
+    def kinds(self) -> Recognised:
+        """Kinds of the columns of numbers that are no times or labels."""
+        others = {*self.times, *self.added.values(), *self.labels}
+        plain = {n: c for n, c in self.columns.items() if not (n in others or c.empty or c.text)}
+        return recognise(plain)
+
+    @cached_property
+    def roles(self) -> dict[str, str]:
+        """Why columns are no sensors, by name: a role, or a kind; empty texts for sensors."""
+        most = max((facts.cells for facts in self.columns.values()), default=0)
+        usable = [recording for recording in self.recordings if recording.file in self.usable]
+        partial = {n for r in usable for n in self._lacking(r)}
+
+        def role(name: str, facts: ColumnFacts) -> str:
+            if basic := self._basic_roles[name]:
+                return basic
+            return "partial" if name in partial else "slow" if facts.cells < SLOW * most else ""
+
+        return {name: role(name, facts) for name, facts in self.columns.items()}
+
+    @cached_property
+    def _basic_roles(self) -> dict[str, str]:
+        """Roles of columns regardless of the files that they are in."""
+        of_kinds: dict[str, str] = {}
+        together: set[str] = set()
+        for kind, found in self.kinds.items():
+            for names in found:
+                of_kinds |= dict.fromkeys(names, "" if kinds()[kind].sensor else kind)
+                together |= {*names} if len(names) > 1 else set()
+        times, labels = {*self.times, *self.added.values()}, {*self.labels}
+
+        def role(name: str, facts: ColumnFacts) -> str:
+            roles = (
+                ("times", name in times),
+                ("labels", name in labels),
+                ("empty", facts.empty),
+                ("text", facts.text),
+                ("", name in together),
+                ("constant", facts.constant),
+                (of_kinds.get(name, ""), bool(of_kinds.get(name))),
+                ("setpoints", facts.set_point),
+            )
+            return next((word for word, holds in roles if holds), "")
+
+        return {name: role(name, facts) for name, facts in self.columns.items()}
+
+    def _lacking(self, recording: RecordingFacts) -> set[str]:
+        """Return the columns that are sensors by their role, or times, and not in a recording."""
+        needed = {n for n, role in self._basic_roles.items() if not role or n in self.times}
+        needed &= {n for n in needed if self.topic_of(n) in recording.rows or n not in self.times}
+        return (needed - {*recording.columns}) | (needed & recording.empty)
+
+    @cached_property
+    def usable(self) -> list[str]:
+        """Files but for copies of others, and those that lack columns of most others.
+
+        At most a fifth are left out so that all have a column. Where none is in all then, the files
+        are those with the commonest columns.
+        """
+        copies = {file for same in self.equal for file in same[1:]}
+        files = dict.fromkeys(r.file for r in self.recordings if r.file not in copies)
+        without: dict[str, set[str]] = defaultdict(set)
+        for recording in (r for r in self.recordings if r.file in files):
+            for name in self._lacking(recording):
+                without[name].add(recording.file)
+        left_out: set[str] = set()
+        for lacking in sorted(without.values(), key=len):
+            if len(left_out | lacking) <= _FEW_FILES * len(files):
+                left_out |= lacking
+        usable = [r for r in self.recordings if r.file in files and r.file not in left_out]
+        if usable and not set.intersection(*(set(r.columns) for r in usable)):
+            ((columns, _),) = Counter(r.columns for r in usable).most_common(1)
+            usable = [r for r in usable if r.columns == columns]
+        return list(dict.fromkeys(r.file for r in usable))
+
+    @cached_property
+    def sensors(self) -> list[str]:
+        """The columns that are sensors of a first recipe."""
+        named = [name for name in self.columns if name.startswith("obs:")]
+        return named or [name for name, role in self.roles.items() if not role]
+
+    def _names(self, topic: Topic, below: str, source: str) -> dict[str, str]:
+        """Return the names of a topic's columns among all, which others may spell otherwise."""
+        whole, names = {f"{below}{name}" for name in topic.names}, {}
+        for name in topic.names:
+            names[name] = f"{below}{name}"
+            if names[name] in self.columns:
+                continue
+            known = self._spellings.setdefault((below, plain_name(name)), names[name])
+            units = {split_unit(known)[1], split_unit(name)[1]} - {""}
+            if known not in whole and len(units) < 2:
+                self._written.setdefault(known, {}).setdefault(names[name], []).append(source)
+                names[name] = known
+        return names
+
+    def settle(self) -> None:
+        """Name columns as most recordings do, and say what is not as in most of them."""
+        new: dict[str, str] = {}
+        for name, others in self._written.items():
+            counts = {name: self.columns[name].recordings - sum(map(len, others.values()))}
+            counts |= {other: len(sources) for other, sources in others.items()}
+            new[name] = max(counts, key=lambda spelling: counts[spelling])
+            for other, sources in others.items() if new[name] == name else ():
+                reason = f"taken from {other!r}, as the file lacks it"
+                for source in sources:
+                    self.ledger.add("column", "changed", reason, name=name, source=source)
+        if {*new} - {*new.values()}:
+            self.columns = {new.get(name, name): facts for name, facts in self.columns.items()}
+            self.recordings = [recording.renamed(new) for recording in self.recordings]
+        for name in (n for n in self.columns if n not in self.labels):
+            facts = self.columns[name]
+            for (reason, source), (count, row, cell) in facts.exceptions.items():
+                values: dict[str, Any] = {"count": count, "source": source, "row": row}
+                if not facts.text:
+                    self.ledger.add(
+                        "cell", EXCEPTIONS[reason], reason, name=name, cell=cell, **values
+                    )
+        for recording in (r for r in self.recordings if r.file not in self.usable):
+            if lacking := self._lacking(recording):
+                reason = f"it lacks {listed(sorted(lacking))}"
+                self.ledger.add("file", "dropped", reason, source=recording.file)
+        for name, role in self.roles.items():
+            if role and role not in {"times", "labels"}:
+                self.ledger.add("column", "dropped", role_of(role).reason, name=name)
+        for name, unit in self.times.items():
+            clocks = [clock for _, clock in self.clocks(name)]
+            if unit not in {"date", "s", "ms", unit_in(name)}:
+                reason = f"its numbers are taken for {UNIT_NAMES[unit]} by their size"
+                self.ledger.add("column", "kept", reason, name=name)
+            if any(len(clock.by_order) > 1 for clock in clocks):
+                self.ledger.add("column", "kept", f"dates with the {self.date_order}", name=name)
+
     def add(self, recording: Recording, file: str) -> None:
         """Read the rows of a recording in blocks and keep what is in them."""
+        if not any(topic.rows for topic in recording.topics.values()):
+            self.ledger.add("file", "dropped", "no rows", source=file)
+            return
         folder = self.path if self.path.name != file else self.path.parent
         source = recording.source.removeprefix(f"{folder}/")
         columns: dict[str, ColumnFacts] = {}
         before: dict[str, Counter[float | str]] = {}
+        numbers_before: dict[str, int] = {}
         clocks: dict[str, ClockFacts] = {}
         added: dict[str, str] = {}
         digest = hashlib.sha256()
@@ -228,9 +395,11 @@ class Inspection:
         topics = recording.topics.items()
         for topic_name, topic in topics:
             below = f"{topic_name}." if topic_name else ""
-            for name in (f"{below}{name}" for name in topic.names):
+            names = self._names(topic, below, source)
+            for name in names.values():
                 columns[name] = self.columns.setdefault(name, ColumnFacts())
                 before[name] = Counter(columns[name].values or {})
+                numbers_before[name] = columns[name].numbers.count
                 columns[name].begin(source)
             likely: list[tuple[str, ...]] = []
             stamps: dict[str, list[Column]] = {}
@@ -246,8 +415,8 @@ class Inspection:
                 rows = np.zeros(len(next(iter(block.values()))) if hashed else 0, np.uint64)
                 for name, cells in block.items():
                     if start != following:
-                        columns[f"{below}{name}"].leap()
-                    columns[f"{below}{name}"].add(cells, start)
+                        columns[names[name]].leap()
+                    columns[names[name]].add(cells, start)
                     digest.update(cells.tobytes())
                 for name in hashed:
                     rows = rows * _PRIME ^ np.ascontiguousarray(block[name]).view(np.uint64)
@@ -257,12 +426,12 @@ class Inspection:
                 numbered.append(np.arange(start, following))
                 for name in stamps:
                     stamps[name].append(block[name])
-            for names in likely:
-                columns_of = [np.concatenate(stamps[name]) for name in names]
+            for first, *more in likely:
+                columns_of = [np.concatenate(stamps[name]) for name in (first, *more)]
                 with contextlib.suppress(TrajectoryError):
                     if clock := ClockFacts.of(np.concatenate(numbered), columns_of):
-                        clocks[f"{below}{names[0]}"] = clock
-                        added |= {f"{below}{names[0]}": f"{below}{name}" for name in names[1:]}
+                        clocks[names[first]] = clock
+                        added.update((names[first], names[name]) for name in more)
         self.ledger.merge(recording.ledger, source)
         self.recordings.append(
             RecordingFacts(
@@ -276,6 +445,7 @@ class Inspection:
                 added,
                 {name: c.values - before[name] for name, c in columns.items() if c.values},
                 dict(recording.fields),
+                frozenset(n for n, c in columns.items() if c.numbers.count == numbers_before[n]),
                 digest.hexdigest(),
                 head,
                 tail,
@@ -361,8 +531,15 @@ def inspect_logs(
     for file in filter(exchanged.__contains__, files):
         for recording in reader.read(file, {**options, "transpose": True}):
             result.add(recording, names[file])
-    if result.problems and not result.recordings:
-        raise TrajectoryError(result.problems[0])
+    there = {recording.file for recording in result.recordings}
+    result.unreadable += [
+        names[file]
+        for file in files
+        if names[file] not in {*there, *result.unreadable, result.intervals}
+    ]
+    if not there:
+        no_rows = f"{str(path)!r} has no rows, expected some"
+        raise TrajectoryError((result.problems or [no_rows])[0])
     order = {name: i for i, name in enumerate(names.values())}
     result.recordings.sort(key=lambda recording: order[recording.file])
     result.equal = _equal(result.recordings)
@@ -373,10 +550,7 @@ def inspect_logs(
     shared = Counter(r.file for r in result.recordings if len(by_digest[r.digest]) > 1)
     result.shared = {file: n for file, n in shared.items() if file not in equal}
     result.continued = _continued(result.recordings)
-    for name in [n for n, c in result.columns.items() if not c.text and n not in result.labels]:
-        for (reason, source), (count, row, cell) in result.columns[name].exceptions.items():
-            values: dict[str, Any] = {"name": name, "count": count, "source": source, "row": row}
-            result.ledger.add("cell", EXCEPTIONS[reason], reason, cell=cell, **values)
+    result.settle()
     return result
 
 
@@ -494,12 +668,11 @@ def _time_columns(topic: Topic, block: Mapping[str, Column]) -> list[tuple[str, 
     """Return columns that may have times of rows, and pairs of columns whose times add up."""
     texts: dict[str, str] = {}
     for name, cells in block.items():
-        if cells.dtype.kind == "U" and len(cells) and cells[0]:
-            with contextlib.suppress(TrajectoryError):
-                seconds = parse_times(cells[:3], "", "day first")
-                texts[name] = "date" if not (seconds % 86400).any() else "moment"
-                if ":" in cells[0] and np.nanmax(np.abs(seconds)) < _DAY:
-                    texts[name] = "time of day"
+        begins = cells[:3] if cells.dtype.kind == "U" and cells[:1].any() else cells[:0]
+        if len(begins) and (seconds := parse_dates(begins)) is not None:
+            texts[name] = "date" if not (seconds % _DAY).any() else "moment"
+            if ":" in begins[0] and np.nanmax(np.abs(seconds)) < _DAY:
+                texts[name] = "time of day"
     pairs = pairs_of(topic.names) if not topic.time else {}
     dates, times = ([n for n in texts if texts[n] == kind] for kind in ("date", "time of day"))
     pairs |= dict(zip(dates[:1], times[:1], strict=False))

@@ -14,9 +14,8 @@ import numpy as np
 
 from oodd_eval.data.facts import ANOMALIES
 from oodd_logs.inspection.columns import ColumnFacts
-from oodd_logs.inspection.logs import Inspection, RecordingFacts
+from oodd_logs.inspection.logs import SLOW, Inspection, RecordingFacts
 from oodd_logs.kinds.times import SCALES
-from oodd_logs.selecting import split_unit
 from oodd_logs.stamps import GAP_STEPS
 
 NOMINAL_WORDS: Final = re.compile(
@@ -27,8 +26,6 @@ NOMINAL_WORDS: Final = re.compile(
 _TASK: Final = re.compile(r"(?:^|_)(?:task|setpoint|set_point)(?:_id|_index)?$", re.IGNORECASE)
 _WINDOWS: Final = 100  # episodes that long recordings are cut to, roughly
 _SHORTEST: Final = 50  # rows of a window
-SLOW: Final = 0.1
-"""Share of the rows of the fullest topic, below which one is left out at first."""
 ENOUGH: Final = 38
 """Nominal episodes of which a third is enough for a threshold."""
 _LAYOUTS: Final = {"onset", "seed", "terminated", "parameters", "discrete", "start"}
@@ -41,36 +38,6 @@ class Sorting:
     nominal: tuple[str, ...]
     anomalous: Mapping[str, tuple[str, ...]]
     reason: str
-
-
-def roles_of(logs: Inspection) -> dict[str, str]:
-    """Return why each column is no sensor, in a word; an empty text for one that is."""
-    files = {*usable_files(logs)}
-    common = set.intersection(*(set(r.columns) for r in logs.recordings if r.file in files))
-    most = max((facts.cells for facts in logs.columns.values()), default=0)
-    times, labels = logs.times, {*logs.labels}
-
-    def role(name: str, facts: ColumnFacts) -> str:
-        is_what = {
-            "times": name in times,
-            "labels": name in labels,
-            "empty": facts.empty,
-            "text": facts.text,
-            "constant": facts.constant,
-            "counters": facts.counter,
-            "setpoints": facts.set_point,
-            "partial": name not in common,
-            "slow": facts.cells < SLOW * most,
-        }
-        return next((word for word, holds in is_what.items() if holds), "")
-
-    return {name: role(name, facts) for name, facts in logs.columns.items()}
-
-
-def sensors_of(logs: Inspection) -> list[str]:
-    """Return the columns that are sensors of a first recipe."""
-    named = [name for name in logs.columns if name.startswith("obs:")]
-    return named or [name for name, role in roles_of(logs).items() if not role]
 
 
 def fields_of(logs: Inspection) -> dict[str, Counter[Any]]:
@@ -107,22 +74,9 @@ def anomalous_rows(recording: RecordingFacts, label: str, nominal: Sequence[floa
     return sum(n for v, n in recording.values.get(label, {}).items() if v not in nominal)
 
 
-def usable_files(logs: Inspection) -> list[str]:
-    """Return the files but for those with the rows of one before, or with no column in common.
-
-    Where no column is in all recordings, the files are those with the commonest columns.
-    """
-    copies = {file for same in logs.equal for file in same[1:]}
-    recordings = [r for r in logs.recordings if r.file not in copies]
-    if recordings and not set.intersection(*(set(r.columns) for r in recordings)):
-        ((columns, _),) = Counter(r.columns for r in recordings).most_common(1)
-        recordings = [r for r in recordings if r.columns == columns]
-    return list(dict.fromkeys(r.file for r in recordings))
-
-
 def sort_files(logs: Inspection) -> Sorting:
     """Tell files apart by labels, else by their names."""
-    files = usable_files(logs)
+    files = logs.usable
     every = {"fault": tuple(files)}
     if logs.labels:
         label = logs.labels[0]
@@ -244,8 +198,3 @@ def _key_of(name: str, counts: Counter[Any]) -> str:
     if any(NOMINAL_WORDS.search(str(value)) for value in counts):
         return "kinds"
     return "task" if _TASK.search(name) else ""
-
-
-def bare_name(column: str) -> str:
-    """Return the name of a sensor without its prefix and unit, as other keys name it."""
-    return split_unit(re.sub(r"^(obs|action):\s*", "", column))[0]

@@ -1,6 +1,5 @@
 """A report on logs before they are imported, in words and as a table."""
 
-import json
 import re
 import textwrap
 from collections import Counter
@@ -15,7 +14,6 @@ from oodd_logs.inspection.logs import READ_ROWS, Inspection
 from oodd_logs.inspection.meaning import (
     ENOUGH,
     anomalous_rows,
-    bare_name,
     cuts_of,
     fields_of,
     gap_of,
@@ -25,16 +23,18 @@ from oodd_logs.inspection.meaning import (
     nominal_recordings,
     nominal_values,
     rate_of,
-    roles_of,
     sort_files,
     step_of,
     window_of,
 )
+from oodd_logs.inspection.roles import ROLES, line_of, role_of, toml
+from oodd_logs.kinds import kinds
 from oodd_logs.kinds.times import SCALES, UNIT_NAMES
 from oodd_logs.readers import quantity
 from oodd_logs.recipe import MISSING_ROWS
 from oodd_logs.stamps import GAP_STEPS
 
+_LINES: Final = 12  # of the ledger
 _MANY: Final = 60  # columns beyond which the table has only those that look like something
 
 
@@ -66,17 +66,8 @@ _TEXTS: Final = {
     "gaps": "{gaps} of more than {steps} steps, the longest {longest} s before row {row} of "
     "{file}: gap = {gap} cuts recordings there",
     "falls": "{rows} earlier than the row before: gap = {gap} cuts recordings there",
-    "empty": "{names}: no value in any row; leave out",
-    "text": "{names}: text is no sensor; it may be labels, kinds or task",
-    "constant": '{names}: one value only; leave out, or write constant = "drop"',
-    "counters": "{names}: rising without end, a counter or clock, no sensor",
-    "setpoints": "{names}: constant in each recording, different between them: a set point (write "
-    "task = {first}) or a label, no sensor",
     "missing": "{names}: {share} of values are missing{worst}, up to {longest} in a run{leading}: "
     'write missing = "hold"{most}',
-    "flags": "{names}: few values; a command, a state, or a label by another name",
-    "angles": "{names}: jumps of a full turn; write angles = {bare}, which makes sine and cosine "
-    "of each",
     "float32": "{names}: little change for the size ({first}: {spread} around {mean}), which "
     "float32 would lose: the import subtracts training's mean in float64",
     "intervals": '{file} names rows of files: write intervals = "{file}"',
@@ -147,9 +138,7 @@ def _of_times(logs: Inspection) -> Iterator[Advice]:
         return
     ((name, unit),) = times.items()
     clocks, step = logs.clocks(name), step_of(logs, name)
-    suffix = "" if unit in {"date", "s"} else f"[{unit}]"
-    keys = [] if name in logs.stamps else [f'time = "{name}{suffix}"']
-    keys += [f"rate = {rate}"] if step > 0 else []
+    keys = time_lines(logs, name, unit) + ([f"rate = {rate}"] if step > 0 else [])
     yield _say("time", name=name, unit=UNIT_NAMES[unit], step=number(step), keys=", ".join(keys))
     rates = [(r, clock.steps.usual * SCALES[unit]) for r, clock in clocks]
     if other_rates := [(r.file, other) for r, other in rates if abs(other - step) > 0.1 * step]:
@@ -167,10 +156,12 @@ def _of_times(logs: Inspection) -> Iterator[Advice]:
 
 
 def _of_columns(logs: Inspection) -> Iterator[Advice]:
-    roles = roles_of(logs)
-    for role in ("empty", "text", "constant", "counters", "setpoints"):
-        if names := [name for name in roles if roles[name] == role]:
-            yield _say(role, names=listed(names), first=toml(names[0]))
+    roles = logs.roles
+    for role in ROLES:
+        names = [name for name in roles if roles[name] == role]
+        if names and ROLES[role].advice:
+            text = ROLES[role].advice.format(names=listed(names), first=toml(names[0]))
+            yield Advice(role, text)
     plain = {n: logs.columns[n] for n in roles if roles[n] in {"", "partial", "slow"}}
     if missing := {n: c.missing / c.cells for n, c in plain.items() if lacks_values(n, c)}:
         worst = max(missing, key=lambda name: missing[name])
@@ -185,10 +176,10 @@ def _of_columns(logs: Inspection) -> Iterator[Advice]:
             longest=counted(longest, "row(s)"),
             most=f", missing_rows = {longest}" if longest > MISSING_ROWS else "",
         )
-    if flags := [name for name, c in plain.items() if c.flag]:
-        yield _say("flags", names=listed(flags))
-    if angles := [name for name, c in plain.items() if c.period]:
-        yield _say("angles", names=listed(angles), bare=toml([*map(bare_name, angles)]))
+    for name, found in logs.kinds.items():
+        kind, names = kinds()[name], [n for together in found for n in together]
+        text = kind.words.format(names=listed(names), line=line_of(kind, found))
+        yield Advice(f"{name}s", text)
     if coarse := [name for name, c in plain.items() if c.coarse]:
         spread, mean = plain[coarse[0]].numbers.spread, plain[coarse[0]].numbers.mean
         texts = {"spread": number(spread), "mean": number(mean)}
@@ -227,27 +218,23 @@ def _of_labels(logs: Inspection) -> Iterator[Advice]:
 
 def looks_like(logs: Inspection) -> dict[str, str]:
     """Return in words what each column looks like; an empty text for a plain number."""
-    times, roles = logs.times, roles_of(logs)
+    of_kinds = {
+        name: f"{kind}: {value if isinstance(value, str) else number(value)}" if value else kind
+        for kind, found in logs.kinds.items()
+        for names, value in found.items()
+        for name in names
+    }
 
     def looks(name: str) -> str:
-        facts = logs.columns[name]
-        values = [] if facts.values is None else sorted(facts.values, key=str)
-        texts = ", ".join(v if isinstance(v, str) else number(v) for v in values)
-        by_role = {
-            "times": f"time ({UNIT_NAMES.get(times.get(name, ''), '')})",
-            "labels": f"label? {texts}",
-            "text": f"text: {texts}" if values else "text, many values",
-            "counters": "counter: never falls",
-            "empty": "empty",
-            "constant": "constant",
-        }
-        if roles[name] in by_role:
-            return by_role[roles[name]]
-        if facts.flag:
-            return f"flag: {texts}"
-        if facts.period:
-            return f"angle that wraps at {number(facts.period)}"
-        return "float32 is too coarse" if facts.coarse else ""
+        facts, role = logs.columns[name], logs.roles[name]
+        values = "many values"
+        if facts.values is not None:
+            texts = sorted(facts.values, key=str)
+            values = ", ".join(v if isinstance(v, str) else number(v) for v in texts)
+        words = {"kind": of_kinds.get(name, ""), "values": values}
+        words["unit"] = UNIT_NAMES.get(logs.times.get(name, ""), "added")
+        coarse = "float32 is too coarse" if facts.coarse else ""
+        return (role_of(role).looks.format_map(words) if role else "") or words["kind"] or coarse
 
     return {name: looks(name) for name in logs.columns}
 
@@ -283,7 +270,10 @@ def describe_logs(logs: Inspection, width: int = 80) -> str:
     if len(logs.topics) > 1:
         parts.append(_topic_table(logs))
     parts.append(_column_table(logs, width))
-    advice = [*advise(logs), *(Advice("ledger", line) for line in logs.ledger.lines(files))]
+    said = [e for e in logs.ledger if (e.item, e.fate) != ("column", "dropped")]
+    lines = [entry.line(len(logs.recordings)) for entry in said[:_LINES]]
+    lines += [f"{len(said) - _LINES} more, which --json has"] if len(said) > _LINES else []
+    advice = [*advise(logs), *(Advice("ledger", line) for line in lines)]
     if advice:
         indent = max(len(topic) for topic, _ in advice) + 2
         wrapper = textwrap.TextWrapper(min(width, 110), break_on_hyphens=False)
@@ -354,6 +344,36 @@ def _share(share: float) -> str:
     return f"{100 * share:.2g} %" if share < 0.995 else f"{100 * share:.3g} %"
 
 
-def toml(value: Any) -> str:
-    """Return a text, number, truth value or a list of them as TOML, which they share with JSON."""
-    return json.dumps(list(value) if isinstance(value, tuple) else value, ensure_ascii=False)
+def time_lines(logs: Inspection, name: str, unit: str) -> list[str]:
+    """Return the lines of a recipe for a column with the times of rows, and its unit."""
+    lines = []
+    if name not in logs.stamps:
+        suffix = "" if unit in {"date", "s"} or "[" in name else f"[{unit}]"
+        columns = [f"{name}{suffix}", *filter(None, [logs.added.get(name)])]
+        lines.append(f"time = {toml(columns if columns[1:] else columns[0])}")
+    return [*lines, *([f"dates = {toml(logs.date_order)}"] if logs.date_order else [])]
+
+
+def as_json(logs: Inspection) -> dict[str, Any]:
+    """Return what is in logs as values for JSON: columns, kinds, advice, the ledger."""
+    looks = looks_like(logs)
+    columns = []
+    for name, facts in logs.columns.items():
+        moments = facts.numbers if facts.numbers.count else None
+        span = {k: float(getattr(moments, k)) if moments else None for k in ("low", "high", "mean")}
+        counts = {k: getattr(facts, k) for k in ("recordings", "cells", "missing")}
+        role = {"role": logs.roles[name] or "sensor", "looks": looks[name]}
+        columns.append({"name": name, **role, **counts, **span})
+    return {
+        "path": str(logs.path),
+        "format": logs.form,
+        "episodes": [{"file": r.file, "name": r.name, "rows": r.length} for r in logs.recordings],
+        "times": logs.times,
+        "columns": columns,
+        "kinds": {
+            kind: [{"columns": names, "value": value} for names, value in found.items()]
+            for kind, found in logs.kinds.items()
+        },
+        "advice": [advice._asdict() for advice in advise(logs)],
+        "ledger": logs.ledger.as_json(),
+    }
