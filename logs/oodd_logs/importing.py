@@ -40,6 +40,7 @@ from oodd_logs.episodes import (
     matching_files,
     read_episodes,
 )
+from oodd_logs.ledger import Ledger
 from oodd_logs.marks import IntervalList, read_intervals
 from oodd_logs.readers import readers
 from oodd_logs.recipe import AnomalousFiles, Interval, NominalFiles, Recipe
@@ -71,6 +72,7 @@ def import_recipe(
     replace: bool = False,
     progress: Say = _quiet,
     report: Say = _quiet,
+    ledger: Ledger | None = None,
 ) -> Split:
     """Import logs as a recipe says, as one environment of a split.
 
@@ -90,6 +92,8 @@ def import_recipe(
         Called with the name of each part when it is written.
     report
         Called with each line of what was read and what was left out.
+    ledger
+        Takes all that was left out, held or changed.
 
     Returns
     -------
@@ -108,6 +112,7 @@ def import_recipe(
     for name in (layout.MANIFEST, f"{recipe.environment}.h5"):
         refuse_inputs(target.directory / name, files_of(recipe, root), "the split's file")
     with read_episodes(recipe, root) as source:
+        (Ledger() if ledger is None else ledger).merge(source.ledger)
         return target.write(source, progress, report)
 
 
@@ -125,8 +130,7 @@ def import_data(
     groups: Mapping[str, str] | None = None,
     output: Path | None = None,
     replace: bool = False,
-    progress: Say = _quiet,
-    report: Say = _quiet,
+    **say: Any,
 ) -> Split:
     """Import parts in one format, of which test episodes have twins: a recipe in short.
 
@@ -152,7 +156,7 @@ def import_data(
         Groups of anomalies that the benchmark does not know, by default ``"dynamics"``.
     output
         Directory of the split, by default where splits are found.
-    replace, progress, report
+    replace, **say
         As for `import_recipe`.
 
     Returns
@@ -194,7 +198,7 @@ def import_data(
     recipe = Recipe(name, environment, **keys)
     recipe.check()
     named = _with_names(recipe, sensors, actions)
-    return import_recipe(named, Path(), output, replace=replace, progress=progress, report=report)
+    return import_recipe(named, Path(), output, replace=replace, **say)
 
 
 def _files_of(form: str, part: Path) -> tuple[str, ...]:
@@ -421,7 +425,8 @@ class _Target:
                 logs=None if facts == LogFacts() else facts,
                 recordings=_recordings(source),
             )
-            entries = {**entries, environment: entry}
+            # No part of the digest: it is of the episodes.
+            entries = {**entries, environment: entry | {"ledger": source.summary}}
             ordered = {name: entries[name] for name in in_order(entries, ENVIRONMENTS)}
             versions = {"oodd-eval": __version__, "numpy": np.__version__}
             definition = {"name": recipe.split, "source": IMPORTED}

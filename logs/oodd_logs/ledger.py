@@ -202,7 +202,8 @@ class Ledger:
         others = [entry for entry in self if entry not in left_out]
         lines = [e.line(total) for e in sorted(others, key=lambda entry: len(entry.sources))]
         more = len(lines) - _LINES
-        return [line, *lines[:_LINES], *([f"{more} more, which --json has"] if more > 0 else [])]
+        lines = [line, *lines[:_LINES], *([f"{more} more, which --json has"] if more > 0 else [])]
+        return ["".join(c if c.isprintable() else " " for c in line) for line in lines]
 
     def as_json(self) -> list[dict[str, Any]]:
         """Return the entries as values for JSON."""

@@ -90,8 +90,6 @@ class TopicRows:
         """
         if self._policy == "refuse":
             return np.arange(self._count)
-        if self._policy == "keep":  # for the scan to say, but for what the logger's end leaves
-            return np.arange(self._count - self._ending())
         firsts = np.full(len(self._columns), -1)
         complete = np.zeros(self._count, bool)
         for start in range(0, self._count, self._step):
@@ -100,20 +98,23 @@ class TopicRows:
             firsts[now] = start + present.argmax(axis=0)[now]
             present[-1:] |= self._may_end & (start + len(present) == self._count)
             complete[start : start + len(present)] = present.all(axis=1)
-            if self._policy == "hold" and firsts.min(initial=0) >= 0:
+            if self._policy != "drop" and firsts.min(initial=0) >= 0:
                 break
         lacking = [name for name, row in zip(self._columns, firsts, strict=True) if row < 0]
+        if self._policy == "keep" and lacking:  # for the scan to say
+            return np.arange(self._count)
         kept = np.flatnonzero(complete)
         if lacking or (self._policy == "drop" and not len(kept)):
             problem = f"column {lacking[0]!r} has no value" if lacking else "no row has all values"
             raise TrajectoryError(
                 f"{self._source}: {problem}, expected some: leave the column or the file out"
             )
-        if self._policy == "hold":
+        if self._policy != "drop":
             first = self._position = int(firsts.max(initial=0))
             late = self._columns[int(firsts.argmax())] if first else ""
             self._say("row", "dropped", "before the first value", late, first, 0)
-            return np.arange(first, self._count)
+            last = self._count - (self._ending() if self._policy == "keep" else 0)
+            return np.arange(first, last)
         dropped = np.diff(kept) - 1
         if dropped.max(initial=0) > self._most:
             row = int(kept[int(dropped.argmax())]) + 1
@@ -124,8 +125,8 @@ class TopicRows:
 
     def _ending(self) -> int:
         """Return how many last rows lack values of some columns, as where a logger was ended."""
-        most = min(self._most, self._count // 10)
-        lacks = ~np.isfinite(self._cells(self._count - most, self._count))[::-1]
+        most = max(1, min(self._most, self._count // 10))
+        lacks = np.isnan(self._cells(self._count - most, self._count))[::-1]
         ends = np.where(lacks.all(axis=0), 0, lacks.argmin(axis=0))
         ends[self._may_end & (ends == 1)] = 0
         count = int(ends.max(initial=0))

@@ -221,6 +221,11 @@ class _Doubts:
     @hookimpl
     def oodd_run_started(self, plan: Plan) -> None:
         """Print what no detector is needed to find out, but for what stands below the tables."""
+        for name in dict.fromkeys(unit.environment for unit in plan.units):
+            _, *lines = self._split.manifest["environments"][name].get("ledger", [""])
+            more = f" and {len(lines) - 1} more (data info {self._split.name})" * (len(lines) > 1)
+            for line in lines[:1]:
+                self.say(f"{name}, of its logs: {line}{more}")
         doubts = doubts_before(plan, self._split)
         self.print((name, doubt) for name, doubt in doubts if doubt.subject != "episodes")
 

@@ -80,7 +80,8 @@ def describe(
             lines += ["", *environment_lines(data, title)]
             lines += strength_lines(split, name)
             if data.logs:
-                lines += (line for remark in remarks(data) for line in _WRAPPER.wrap(remark))
+                sentences = (*data.ledger, *remarks(data))
+                lines += (line for sentence in sentences for line in _WRAPPER.wrap(sentence))
             if name in ENVIRONMENTS and data.logs is None:
                 returns[name] = collect_returns(data)
     if returns:

@@ -445,6 +445,7 @@ def _manifest_schema() -> Any:
         "units": units,
         "logs": logs,
         "recordings": by_name(parts, runs),
+        "ledger": core_schema.list_schema(text),  # what became of logs, a line each
     }
     for key, optional in optional_fields.items():
         environment["fields"][key] = core_schema.typed_dict_field(optional, required=False)

@@ -265,6 +265,8 @@ class EnvironmentData:
         True when an action is a one-hot row.
     logs
         Facts of an environment that was imported; None for one that was recorded.
+    ledger
+        Sensors and what became of logs that were imported, a line each.
     """
 
     def __init__(
@@ -278,7 +280,9 @@ class EnvironmentData:
         logs: LogFacts | None = None,
         roles: Sequence[Role] = (),
         recordings: Mapping[str, tuple[str, ...]] | None = None,
+        ledger: Sequence[str] = (),
     ) -> None:
+        self.ledger = tuple(ledger)
         self.id, self.digest, self.discrete, self.logs = environment, digest, discrete, logs
         self._recordings = dict(recordings or {})
         self._file, self._parts = file, parts

@@ -372,6 +372,7 @@ class Split:
             logs=logs,
             roles=layout.roles_in(name, entry),
             recordings=layout.recordings_of(entry),
+            ledger=entry.get("ledger", ()),
         )
 
     @contextlib.contextmanager

@@ -224,7 +224,7 @@ def _records(
         "reason": scored.reason,
         "steps_scored": steps,
         "paired": job.data.paired,
-        "provenance": {**origin, **device},
+        "provenance": origin | device | ({"logs": [*job.data.ledger]} if job.data.ledger else {}),
         **{name: cost[name] for name in COSTS if name in cost},
     }
     records = [

@@ -1,22 +1,25 @@
 """``oodd-eval data import``: make a split of logs."""
 
+import json
 import shlex
 from pathlib import Path
 from typing import Any, Final
 
 import click
 
-from oodd_eval.cli import COUNT, DIRECTORY, Converted, Options, command
+from oodd_eval.cli import COUNT, DIRECTORY, OUTPUT_FILE, Converted, Options, command
 from oodd_eval.cli.console import make_console
 from oodd_eval.cli.data import output_option
 from oodd_eval.data.facts import Quantity
-from oodd_eval.data.files import refuse_inputs
+from oodd_eval.data.files import refuse_inputs, write_text
 from oodd_eval.errors import UsageError
 from oodd_eval.names import assignment
 from oodd_eval.prose import print_prose
 from oodd_eval.scoring.promises import promises_of
 from oodd_logs.commands.reader_plugins import register_formats
+from oodd_logs.episodes import files_of
 from oodd_logs.importing import import_data, import_recipe
+from oodd_logs.ledger import Ledger
 from oodd_logs.readers import quantity
 from oodd_logs.recipe import Recipe
 from oodd_logs.shipped_recipes import shipped_recipes
@@ -62,12 +65,15 @@ _DETECTORS: Final = "mewma,mahalanobis,range,clock"  # fitted in seconds, withou
 @click.option("--discrete", type=COUNT, help="actions are whole numbers from 0 to N - 1")
 @click.option("--group", multiple=True, type=_GROUP, help="group of an anomaly (default: dynamics)")
 @click.option("--replace", is_flag=True, help="import anew what the split has by that name")
+@click.option("--json", type=OUTPUT_FILE, help="write what was left out, held or changed as JSON")
 @output_option
 def import_logs(options: Options) -> int:
     """Import logs of your own as an environment of a split."""
     register_formats(options)
     notes, console = make_console(quiet=options.verbosity < 0), make_console()
+    ledger = Ledger()
     say: dict[str, Any] = {
+        "ledger": ledger,
         "output": options.output,
         "replace": options.replace,
         "progress": lambda part: notes.print(f"writing {part}"),
@@ -87,6 +93,8 @@ def import_logs(options: Options) -> int:
         environment, root = recipe.environment, options.root or path.parent
         if options.output:
             refuse_inputs(options.output, [root], "--output")
+        if options.json:
+            refuse_inputs(options.json, [path, *files_of(recipe, root)], "--json")
         split = import_recipe(recipe, root, **say)
     else:
         if lacking := [name for name in _REQUIRED if name not in keys]:
@@ -100,6 +108,8 @@ def import_logs(options: Options) -> int:
         environment, form = keys.pop("env"), keys.pop("format")
         groups = dict(keys.pop("group", ()))
         split = import_data(options.name, environment, form=form, groups=groups, **keys, **say)
+    if options.json:
+        write_text(options.json, json.dumps({"ledger": ledger.as_json()}, indent=1) + "\n")
     console.print(f"split {split.name}, digest {split.digest[:12]}, in {split.path}")
     with split.opened() as opened:
         data = opened(environment)
