@@ -1,5 +1,6 @@
 """Episodes as ``.npz`` files of named arrays, or an ``.npy`` file with one array."""
 
+import dataclasses
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final, cast
@@ -13,9 +14,7 @@ from oodd_logs.readers.cells import WIDEST
 from oodd_logs.readers.matrices import MatrixRows, episode_of, whole_number
 from oodd_logs.recording import Recording
 
-_BOUNDS: Final = Bounds(
-    EPISODE.most, TrajectoryError, EPISODE.advice, kinds="fiubU", entries=WIDEST
-)
+_BOUNDS: Final = dataclasses.replace(EPISODE, kinds="fiubU", entries=WIDEST)
 
 
 def _open(path: Path, options: Options) -> Iterator[Recording]:
