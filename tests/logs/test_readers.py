@@ -430,12 +430,38 @@ def test_a_parquet_file_is_read_in_ranges(tmp_path):
     assert {name: column.tolist() for name, column in head.items()} == {
         "at": [0.001, 0.002], "ok": [0, 1], "mode": ["b", "a"], "pose.frame": ["map", "map"],
     }  # fmt: skip
-    # Of lists that grow those columns count that all rows have.
-    pq.write_table(pa.table({"x": pa.array([[1.0], [1.0, 2.0]])}), path)
-    assert rows(table("parquet", path))["x.0"] == [1, 1]
-    pq.write_table(pa.table({"x": pa.array([[1.0, 2.0], [1.0]])}), path)
-    with pytest.raises(TrajectoryError, match="lists have from 1 to 2 items"):
-        rows(table("parquet", path))
+
+
+def test_lists_in_a_parquet_file_are_columns_figures_or_named(tmp_path):
+    columns = {
+        "grow": pa.array([[1.0], [1.0, 2.0], None]),
+        "shrink": pa.array([[1, 2], [3], []]),
+        "some": pa.array([[1.0, 2.0], None, [3.0, 4.0]]),
+        "long": pa.array([[float(i)] * 40 for i in range(3)], pa.list_(pa.float32(), 40)),
+        "at": pa.array([{"nanosec": 500_000_000, "sec": i} for i in range(3)]),
+        "status": pa.array([[{"key": "temp", "value": f"{i}.5"}] for i in range(3)]),
+        "more": pa.array([[("volt", 1.0)]] * 3, pa.map_(pa.string(), pa.float64())),
+        "png": pa.array([b"png"] * 3),
+    }
+    pq.write_table(pa.table(columns), tmp_path / "run.parquet")
+    (recording,) = recordings("parquet", tmp_path / "run.parquet")
+    cells = rows(recording.topics[""])
+    nan = np.nan
+    expected = {
+        "grow.least": [1, 1, nan], "grow.mean": [1, 1.5, nan], "grow.count": [1, 2, 0],
+        "shrink.least": [1, 3, nan], "shrink.mean": [1.5, 3, nan], "shrink.count": [2, 1, 0],
+        "some.0": [1, nan, 3], "some.1": [2, nan, 4],
+        "long.least": [0, 1, 2], "long.mean": [0, 1, 2], "long.count": [40, 40, 40],
+        "at": [0.5, 1.5, 2.5], "status.temp": [0.5, 1.5, 2.5], "more.volt": [1, 1, 1],
+    }  # fmt: skip
+    assert [*cells] == [*expected]
+    for name, column in expected.items():
+        assert cells[name] == pytest.approx(column, nan_ok=True)
+    assert [e.name for e in recording.ledger.of("column", "dropped")] == ["png"]
+    assert "long.39" in table("parquet", tmp_path / "run.parquet", lists=["lo*"]).names
+    joints = {"name": pa.array([["hip", "knee"], ["knee", "hip"]]), "q": pa.array([[1, 2], [2, 1]])}
+    pq.write_table(pa.table(joints), tmp_path / "run.parquet")
+    assert rows(table("parquet", tmp_path / "run.parquet")) == {"q.hip": [1, 1], "q.knee": [2, 2]}
 
 
 INFO = {
@@ -526,6 +552,25 @@ def test_a_lerobot_data_set_is_its_episodes(tmp_path, make):
     assert cells["timestamp"] == pytest.approx([0, 0.1, 0.2, 0.3])
     part = topic.read(["action:hip"], 1, 3)
     assert not np.isnan(part["action:hip"]).any()
+
+
+def test_rows_number_their_episodes_and_not_the_table(tmp_path):
+    as_version_3(tmp_path)
+    path = tmp_path / "meta" / "episodes" / "chunk-000" / "file-000.parquet"
+    table_of_episodes = pq.read_table(path).to_pylist()
+    table_of_episodes[0]["dataset_to_index"] += 2
+    table_of_episodes[1]["dataset_from_index"] += 2
+    pq.write_table(pa.Table.from_pylist(table_of_episodes), path)
+    first, second, third = recordings("lerobot", tmp_path)
+    assert [r.topics[""].rows for r in (first, second, third)] == [*LENGTHS]
+    assert rows(second.topics[""])["obs:knee"] == [7, 9, 11, 13]
+    (entry,) = second.ledger.of("recording")
+    assert entry.cell == "5 to 7, but 3 to 7"
+    assert not third.ledger
+    mixed = pa.concat_tables([lerobot_table([0]), lerobot_table([1]), lerobot_table([0])])
+    pq.write_table(mixed, tmp_path / "data" / "chunk-000" / "file-000.parquet")
+    with pytest.raises(TrajectoryError, match="do not follow one another"):
+        recordings("lerobot", tmp_path)
 
 
 def test_a_flat_folder_of_episodes_is_a_lerobot_data_set(tmp_path):

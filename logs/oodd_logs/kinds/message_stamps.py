@@ -19,18 +19,20 @@ _PARTS: Final = {
 _PER_SECOND: Final = {"usec": 1e6}
 
 
-def _flatten(name: str, value: Any) -> Iterable[tuple[str, Any]] | None:
-    """Return the seconds of a stamp; protobuf writes whole ones as texts."""
-    if not isinstance(value, Mapping) or len(value) != 2:
-        return None
+def stamp_of(value: Mapping[str, Any]) -> float | None:
+    """Return the seconds of a stamp, None for another mapping; protobuf has whole ones as texts."""
     keys = _PARTS.get(frozenset(value))
-    if keys is None:
-        return None
     try:
-        whole, rest = (float(value[key]) for key in keys)
-    except (TypeError, ValueError):
+        whole, rest = (float(value[key]) for key in keys or ("", ""))
+    except (KeyError, TypeError, ValueError):
         return None
-    return [(name, whole + rest / _PER_SECOND.get(keys[1], 1e9))]
+    return whole + rest / _PER_SECOND.get(keys[1] if keys else "", 1e9)
+
+
+def _flatten(name: str, value: Any) -> Iterable[tuple[str, Any]] | None:
+    if not isinstance(value, Mapping) or len(value) != 2 or (stamp := stamp_of(value)) is None:
+        return None
+    return [(name, stamp)]
 
 
 KIND: Final = Kind("message-stamps", "", flatten=_flatten)

@@ -21,14 +21,23 @@ def figures(name: str, rows: NDArray[np.float64]) -> dict[str, NDArray[np.float6
     >>> figures("r", np.array([[1.0, np.inf, 3.0]]))
     {'r.least': array([1.]), 'r.mean': array([2.]), 'r.count': array([2.])}
     """
-    flat = rows.reshape(len(rows), -1)
-    finite = np.isfinite(flat)
-    count = finite.sum(axis=1).astype(np.float64)
+    owners = np.repeat(np.arange(len(rows)), rows.size // max(1, len(rows)))
+    made = ragged_figures(rows.ravel(), owners, len(rows))
+    return {f"{name}.{figure}": column for figure, column in made.items()}
+
+
+def ragged_figures(
+    numbers: NDArray[np.float64], owners: NDArray[np.intp], rows: int
+) -> dict[str, NDArray[np.float64]]:
+    """Return the figures of lists, one after the other; `owners` has the row of each number."""
+    finite = np.isfinite(numbers)
+    numbers, owners = numbers[finite], owners[finite]
+    count = np.bincount(owners, minlength=rows).astype(np.float64)
     with np.errstate(all="ignore"):
-        mean = np.where(finite, flat, 0.0).sum(axis=1) / count
-    least = np.where(finite, flat, np.inf).min(axis=1, initial=np.inf)
-    least[count == 0] = np.nan
-    return {f"{name}.{f}": x for f, x in zip(FIGURES, (least, mean, count), strict=True)}
+        mean = np.bincount(owners, numbers, minlength=rows) / count
+    least = np.full(rows, np.nan)
+    np.fmin.at(least, owners, numbers)
+    return dict(zip(FIGURES, (least, mean, count), strict=True))
 
 
 def is_folded(name: str, size: int) -> bool:

@@ -112,8 +112,8 @@ class Gathered:
                     self._put(label, inner, row, depth + 1)
         elif isinstance(value, list | tuple | np.ndarray):
             self._put_list(name, value, row, depth)
-        elif isinstance(value, int | float | str):
-            row[name] = value
+        else:
+            row[name] = value if isinstance(value, int | float | str) else str(value)
 
     def _put_list(self, name: str, value: Any, row: dict[str, Any], depth: int) -> None:
         """Put a list into a row: of numbers as it is, of objects by their fields."""
@@ -204,6 +204,8 @@ def _unpacked(value: Any) -> Any:
         return value.item()
     if isinstance(value, bytes | bytearray) and len(value) <= number_lists.LONGEST:
         return [*value]
+    if isinstance(value, list) and value and isinstance(value[0], tuple):
+        return dict(value)  # as PyArrow returns maps
     if isinstance(value, SimpleNamespace) and hasattr(value, "__slots__"):
         return {key: getattr(value, key) for key in value.__slots__}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):

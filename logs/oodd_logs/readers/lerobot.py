@@ -14,6 +14,7 @@ import numpy as np
 from oodd_eval.data.bounded import EPISODE, read_bytes, read_json
 from oodd_eval.errors import TrajectoryError
 from oodd_eval.names import natural
+from oodd_logs.ledger import Ledger
 from oodd_logs.readers import Options, Reader, in_order, library, unreadable
 from oodd_logs.readers.cells import column_names
 from oodd_logs.readers.parquet import ParquetRows
@@ -46,17 +47,22 @@ def _open(directory: Path, _options: Options) -> Iterator[Recording]:
     tasks = _lines(info.with_name("tasks.jsonl"), "task_index")
     entries = _lines(info.with_name("episodes.jsonl"), "episode_index")
     for path in sorted(files, key=lambda path: in_order(path.stem)):
-        rows = ParquetRows(path)
+        rows = ParquetRows(path, ["*"])
         number = path.stem.removeprefix("episode_")
         more = entries.get(natural(number), {})
-        yield _episode(path.stem, str(path), rows, (0, rows.rows), facts, tasks, more)
+        length = more.get("length", rows.rows)
+        note = "" if length == rows.rows else f"{length}, but {rows.rows}"
+        yield _episode(path.stem, str(path), rows, (0, rows.rows), facts, tasks, more, note)
 
 
 def _version_3(directory: Path, facts: Facts, episodes: Sequence[Path]) -> Iterator[Recording]:
-    """Yield episodes of files that hold several each; the table of episodes says where."""
+    """Yield episodes of files that hold several each.
+
+    The table of episodes says where. Where the rows themselves number their episodes, they do.
+    """
     tasks = _tasks(directory / "meta" / "tasks.parquet")
     pattern = str(facts.get("data_path", _DATA_PATH))
-    files: dict[tuple[int, int], tuple[ParquetRows, int]] = {}
+    files: dict[tuple[int, int], tuple[ParquetRows, int, dict[int, tuple[int, int]]]] = {}
     for table in episodes:
         for entry in _entries(table):
             try:
@@ -70,19 +76,36 @@ def _version_3(directory: Path, facts: Facts, episodes: Sequence[Path]) -> Itera
             if not path.resolve().is_relative_to(directory.resolve()):
                 raise TrajectoryError(f"{table}: {relative!r} is outside the data set")
             if key not in files:
-                rows = ParquetRows(path)
+                rows = ParquetRows(path, ["*"])
                 # Rows are numbered through all files.
-                files = {key: (rows, int(rows.read(["index"], 0, 1)["index"][0]))}
-            rows, first = files[key]
+                first = int(rows.read(["index"], 0, 1)["index"][0]) if rows.rows else 0
+                files = {key: (rows, first, _spans(rows))}
+            rows, first, spans = files[key]
             start, stop = low - first, high - first
-            if not 0 <= start < stop <= rows.rows:
+            counted = spans.get(number, (start, stop) if not spans else (0, 0))
+            if not 0 <= counted[0] < counted[1] <= rows.rows:
                 raise TrajectoryError(
                     f"{table}: episode {number} is rows {start} to {stop} of {path}, which has "
-                    f"{rows.rows}"
+                    f"{rows.rows}, of the episodes {sorted(spans)[:20]}"
                 )
+            wrong = f"{start} to {stop}, but {counted[0]} to {counted[1]}"
+            note = "" if counted == (start, stop) else wrong
             source = f"{path}, episode {number}"
             name = f"episode_{number:06d}"
-            yield _episode(name, source, rows, (start, stop), facts, tasks, entry)
+            yield _episode(name, source, rows, counted, facts, tasks, entry, note)
+
+
+def _spans(rows: ParquetRows) -> dict[int, tuple[int, int]]:
+    """Return the first row of each episode and the row after its last, by its number."""
+    if "episode_index" not in rows.names or not rows.rows:
+        return {}
+    numbers = rows.read(["episode_index"], 0, rows.rows)["episode_index"]
+    starts = np.flatnonzero(np.append(True, numbers[1:] != numbers[:-1]))
+    stops = np.append(starts[1:], rows.rows)
+    if len({*numbers[starts].tolist()}) < len(starts):
+        raise TrajectoryError(f"{rows.path}: rows of an episode do not follow one another")
+    pairs = zip(starts.tolist(), stops.tolist(), strict=True)
+    return {int(numbers[start]): (start, stop) for start, stop in pairs}
 
 
 def _episode(
@@ -93,8 +116,9 @@ def _episode(
     facts: Facts,
     tasks: Mapping[int, Facts],
     more: Facts,
+    note: str,
 ) -> Recording:
-    """Return an episode; `span` is its rows in the file."""
+    """Return an episode; `span` is its rows in the file, `note` what its table says otherwise."""
     columns = _columns(rows.names, facts, source)
     first, count = span[0], span[1] - span[0]
     counters = [n for n in ("episode_index", "task_index") if n in rows.names and count]
@@ -124,7 +148,12 @@ def _episode(
                 table[label] = np.append(table[label][:-1], np.nan)
         return table
 
-    return Recording(name, source, {"": Topic(names, count, read, time)}, fields)
+    ledger = Ledger()
+    ledger.merge(rows.ledger)
+    if note:
+        reason = "rows are those that the data has, not those of the table of episodes"
+        ledger.add("recording", "changed", reason, cell=note)
+    return Recording(name, source, {"": Topic(names, count, read, time)}, fields, ledger)
 
 
 def _columns(names: Sequence[str], facts: Facts, source: str) -> dict[str, str]:

@@ -122,11 +122,11 @@ def episode_of(
             array = arrays[name]
             size = array.dtype.itemsize * math.prod(array.shape[1:]) * (stop - start)
             EPISODE.check(f"{source}, {name}", array.dtype, size)
-            blocks[name] = array[start:stop]
+            blocks[name] = np.asarray(array[start:stop], np.float64)
         columns = {}
         for label in selected:
             part = labels[label]
-            block = np.asarray(blocks[part.array], np.float64)
+            block = blocks[part.array]
             if isinstance(part.column, str):
                 column = number_lists.figures("", block)[f".{part.column}"]
             else:

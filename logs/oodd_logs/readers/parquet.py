@@ -1,5 +1,7 @@
 """Recordings as Parquet files, of which some thousand rows are in memory at a time."""
 
+import fnmatch
+import re
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,13 +11,16 @@ import numpy as np
 
 from oodd_eval.data.bounded import EPISODE
 from oodd_eval.errors import TrajectoryError
+from oodd_logs.kinds import images, number_lists
+from oodd_logs.kinds.message_stamps import stamp_of
+from oodd_logs.ledger import Ledger
 from oodd_logs.readers import Options, Reader, library
-from oodd_logs.readers.cells import column_names, texts
+from oodd_logs.readers.cells import check_width, column_names, texts
+from oodd_logs.readers.gathered import LISTS, Gathered
 from oodd_logs.recording import Column, Recording, Topic
 
 _BATCH: Final = 2**15  # rows
 _STREAMS: Final = 4  # choices of columns that are read in turns
-_WIDEST: Final = 4096  # numbers in one cell; images have more
 _PER_SECOND: Final = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 
 
@@ -23,14 +28,18 @@ _PER_SECOND: Final = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 class _Leaf:
     """One column of numbers or texts: where it is in a column of the file."""
 
-    # `path` has the fields of structures and positions in lists, as names and numbers.
+    # `path` has the fields of structures and positions in lists, as names and numbers; `figure` is
+    # that of a list which they lead to.
 
     column: str
     path: tuple[str | int, ...]
+    figure: str = ""
 
     @property
     def label(self) -> str:
-        return ".".join(map(str, (self.column, *self.path)))
+        return ".".join(
+            map(str, filter(lambda step: step != "", (self.column, *self.path, self.figure)))
+        )
 
 
 class ParquetRows:
@@ -40,27 +49,45 @@ class ParquetRows:
     ----------
     path
         The file.
+    lists
+        Globs of long lists that are columns by place.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: Path, lists: Sequence[str] = ()) -> None:
+        self.path, self.ledger = path, Ledger()
         with self._opened() as file:
             metadata, schema = file.metadata, file.schema_arrow
             self.rows: int = metadata.num_rows
-            groups = [metadata.row_group(i).num_rows for i in range(metadata.num_row_groups)]
-            lists = [f.name for f in schema if "list<" in str(f.type)]
-            first = next(file.iter_batches(batch_size=64, columns=lists), None) if lists else None
-        self._starts = np.cumsum([0, *groups])
-        leaves = [leaf for f in schema for leaf in _leaves(f.name, f.type, first, path)]
+            groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
+            objects = _objects(schema)
+            listed = [f.name for f in schema if "list<" in str(f.type) and f.name not in objects]
+            first = next(file.iter_batches(batch_size=64, columns=listed), None) if listed else None
+        self._starts = np.cumsum([0, *(group.num_rows for group in groups)])
+        columns = _Columns(path, groups, lists, self.ledger)
+        plain = [f for f in schema if f.name not in objects]
+        leaves = [leaf for f in plain for leaf in columns.leaves(f.name, f.type, first)]
+        check_width(path, len(leaves))
         self._leaves = dict(zip(column_names(leaf.label for leaf in leaves), leaves, strict=True))
+        self._objects = self._gathered(objects, lists) if objects else {}
         stamps = [f.name for f in schema if library("pyarrow").types.is_timestamp(f.type)]
         self.time = stamps[0] if len(stamps) == 1 else ""
         self._streams: dict[tuple[str, ...], _Stream] = {}
 
+    def _gathered(self, objects: Sequence[str], lists: Sequence[str]) -> dict[str, Column]:
+        """Return the columns that are made of objects in the rows of others."""
+        rows = Gathered(str(self.path), lists)
+        with self._opened() as file:
+            for batch in file.iter_batches(batch_size=_BATCH // 32, columns=objects):
+                for row in batch.to_pylist():
+                    rows.add(row)
+        topic = rows.topic()
+        self.ledger.merge(rows.ledger)
+        return topic.read(topic.names, 0, topic.rows)
+
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the columns."""
-        return tuple(self._leaves)
+        return (*self._leaves, *(name for name in self._objects if name not in self._leaves))
 
     def topic(self) -> Topic:
         """Return all rows as a topic."""
@@ -68,7 +95,12 @@ class ParquetRows:
 
     def read(self, names: Sequence[str], start: int, stop: int) -> dict[str, Column]:
         """Return columns of a range of rows."""
-        key = tuple(names)
+        key = tuple(name for name in names if name in self._leaves)
+        table = self._read(key, start, stop) if key else {}
+        table |= {n: self._objects[n][start:stop] for n in names if n not in self._leaves}
+        return {name: table[name] for name in names}
+
+    def _read(self, key: tuple[str, ...], start: int, stop: int) -> dict[str, Column]:
         stream = self._streams.pop(key, None)
         group = max(0, int(np.searchsorted(self._starts, start, side="right")) - 1)
         first = int(self._starts[group])
@@ -82,7 +114,7 @@ class ParquetRows:
         while len(self._streams) > _STREAMS:
             self._streams.pop(next(iter(self._streams))).batches.close()
         columns: dict[str, Column] = {}
-        for name in names:
+        for name in key:
             cells = [part[name] for part in parts] or [np.empty(0)]
             size = sum(part.size for part in cells) * max(part.itemsize for part in cells)
             if cells[0].dtype.kind == "U" and size > EPISODE.most:
@@ -138,30 +170,88 @@ def _count(batch: Mapping[str, Column]) -> int:
     return len(next(iter(batch.values()), ()))
 
 
-def _leaves(column: str, kind: Any, first: Any, path: Path) -> list[_Leaf]:
-    """Return the columns in one of the file: fields of structures, items of lists."""
-    # Lists have as many items as their type says, or those of the first row with any.
-    value = None
-    if first is not None and column in first.schema.names:
-        value = next((cell.as_py() for cell in first.column(column) if cell.is_valid), None)
+def _objects(schema: Any) -> list[str]:
+    """Return the columns whose rows are objects: with names or stamps among their values."""
+    types = library("pyarrow").types
 
-    def inner(kind: Any, value: Any, steps: tuple[str | int, ...]) -> Iterator[_Leaf]:
+    def is_list(kind: Any) -> bool:
+        return types.is_list(kind) or types.is_large_list(kind) or types.is_fixed_size_list(kind)
+
+    def is_object(kind: Any) -> bool:
+        if types.is_struct(kind):
+            return stamp_of({f.name: 0 for f in kind}) is not None or any(
+                is_object(f.type) for f in kind
+            )
+        if is_list(kind):
+            inner = kind.value_type
+            while is_list(inner):
+                inner = inner.value_type
+            return not (types.is_primitive(inner) or types.is_binary(inner))
+        return bool(types.is_map(kind))
+
+    objects = [f.name for f in schema if is_object(f.type)]
+    named = any(is_list(f.type) and types.is_string(f.type.value_type) for f in schema)
+    return [f.name for f in schema if f.name in objects or (named and is_list(f.type))]
+
+
+@dataclass(frozen=True, slots=True)
+class _Columns:
+    """What the columns of a file are made of; `groups` are its row groups."""
+
+    path: Path
+    groups: Sequence[Any]
+    lists: Sequence[str]
+    ledger: Ledger
+
+    def leaves(self, column: str, kind: Any, first: Any) -> list[_Leaf]:
+        """Return the columns in one of the file: fields of structures, items of lists."""
+        value = None
+        if first is not None and column in first.schema.names:
+            value = next((cell.as_py() for cell in first.column(column) if cell.is_valid), None)
+        return [*self._inner(column, kind, value, ())]
+
+    def _inner(
+        self, column: str, kind: Any, value: Any, steps: tuple[str | int, ...]
+    ) -> Iterator[_Leaf]:
         types = library("pyarrow").types
+        name = ".".join(map(str, (column, *steps)))
         if len(steps) > 16:
-            raise TrajectoryError(f"{path}, column {column!r}: more than 16 levels of structure")
+            raise TrajectoryError(
+                f"{self.path}, column {column!r}: more than 16 levels of structure"
+            )
         if types.is_struct(kind):
             for f in kind:
-                yield from inner(f.type, (value or {}).get(f.name), (*steps, f.name))
+                yield from self._inner(column, f.type, (value or {}).get(f.name), (*steps, f.name))
         elif types.is_fixed_size_list(kind) or types.is_list(kind) or types.is_large_list(kind):
             size = kind.list_size if types.is_fixed_size_list(kind) else len(value or ())
-            if size <= _WIDEST:
-                items = value or [None] * size
-                for i in range(size):
-                    yield from inner(kind.value_type, items[i], (*steps, i))
-        elif not (types.is_binary(kind) or types.is_large_binary(kind) or types.is_map(kind)):
+            total = np.size(value) if value else size
+            wide = any(fnmatch.fnmatch(name, glob) for glob in self.lists)
+            fixed = types.is_fixed_size_list(kind) or self._is_constant(name, total)
+            if not fixed or (number_lists.is_folded(name, total) and not wide):
+                self.ledger.add("column", "changed", number_lists.KIND.words, name=name)
+                yield from (_Leaf(column, steps, figure) for figure in number_lists.FIGURES)
+                return
+            items = value or [None] * size
+            for i in range(size):
+                yield from self._inner(column, kind.value_type, items[i], (*steps, i))
+        elif types.is_binary(kind) or types.is_large_binary(kind):
+            self.ledger.add("column", "dropped", images.KIND.words, name=name)
+        else:
             yield _Leaf(column, steps)
 
-    return [*inner(kind, value, ())]
+    def _is_constant(self, name: str, size: int) -> bool:
+        """Tell by the numbers that the file counts whether all lists are as long as the first."""
+        pattern = re.compile(re.escape(re.sub(r"\.\d+\b", "", name)) + r"\.list\..*")
+        values = nulls = rows = 0
+        for group in self.groups:
+            for i in range(group.num_columns):
+                chunk = group.column(i)
+                if pattern.fullmatch(chunk.path_in_schema):
+                    values += chunk.num_values
+                    statistics = chunk.statistics
+                    nulls += statistics.null_count or 0 if statistics else 0
+            rows += group.num_rows
+        return size > 0 and (values == rows * size or values - nulls == size * (rows - nulls))
 
 
 def _values(array: Any, leaf: _Leaf, path: Path) -> Column:
@@ -182,6 +272,13 @@ def _values(array: Any, leaf: _Leaf, path: Path) -> Column:
                     f"{bounds['max']} items, expected as many as in the first row"
                 )
             array = compute.list_element(array, step)
+    if leaf.figure:
+        rows, owners = len(array), np.arange(len(array))
+        while hasattr(array.type, "value_type"):
+            parents = compute.list_parent_indices(array).to_numpy(zero_copy_only=False)
+            owners, array = owners[parents], compute.list_flatten(array)
+        numbers = array.cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False)
+        return number_lists.ragged_figures(numbers, owners, rows)[leaf.figure]
     if types.is_dictionary(array.type):
         array = array.dictionary_decode()
     kind = array.type
@@ -196,8 +293,11 @@ def _values(array: Any, leaf: _Leaf, path: Path) -> Column:
     return np.asarray(numbers) / per_second
 
 
-def _open(path: Path, _options: Options) -> Iterator[Recording]:
-    yield Recording(path.stem, str(path), {"": ParquetRows(path).topic()})
+def _open(path: Path, options: Options) -> Iterator[Recording]:
+    rows = ParquetRows(path, options.get("lists", ()))
+    yield Recording(path.stem, str(path), {"": rows.topic()}, ledger=rows.ledger)
 
 
-READER: Final = Reader("parquet", "a Parquet file", (".parquet", ".pq"), _open, extra="logs")
+READER: Final = Reader(
+    "parquet", "a Parquet file", (".parquet", ".pq"), _open, extra="logs", options=LISTS
+)
