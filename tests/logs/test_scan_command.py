@@ -91,7 +91,7 @@ def test_bands_reasons_and_next_steps(folder, capsys):
     assert sum(map(int, summary.groups())) == 18
     assert len(lines_of(out, "look")) == int(summary[1])
     text = " ".join(out.split())
-    assert re.search(r"Next: look at run-0[57] from row \d+ \((torque|speed)\)", text)
+    assert re.search(r"Next, look at run-0[57] from row \d+: .*(torque|speed)", text)
     assert all(option in text for option in ("--fine ", "--drop FILE", "--keep FILE"))
     assert "Not listed: 10 less odd episodes" in text
 

@@ -1,12 +1,14 @@
 """``oodd-eval scan``: which recorded episodes to look at first, and at which rows and sensors."""
 
 import json
+import re
 import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from fnmatch import filter as fitting
+from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 from urllib.parse import quote
 
 import click
@@ -30,7 +32,7 @@ from oodd_eval.cli import (
 from oodd_eval.cli.console import make_console
 from oodd_eval.data.files import read_text, refuse_inputs, write_text
 from oodd_eval.errors import UnknownNameError, UsageError
-from oodd_eval.names import counted, natural
+from oodd_eval.names import counted
 from oodd_eval.plugins.parameters import parameters_by_detector
 from oodd_eval.prose import print_prose
 from oodd_logs.commands.reader_plugins import register_formats
@@ -45,7 +47,6 @@ from oodd_logs.scanning.viewers import foxglove_link, write_mcap, write_rerun
 _SHARE: Final = click.FloatRange(0, 1, min_open=True, max_open=True)
 _SHARE.name = "SHARE"
 _STYLES: Final = {"surely": "bold red", "look at": "yellow", "fine": ""}
-_NARROWEST: Final = 24  # columns of the terminal that a reason gets
 _OUTPUTS: Final = ("keep", "drop", "json", "html", "rerun", "mcap")
 _COLUMNS: Final = (
     "p: how often a fine episode is as odd by chance; q: the smallest false discovery rate (--fdr) "
@@ -107,8 +108,6 @@ def scan(options: Options) -> int:
         refuse(options, ["detector", "param", "jobs"], judges)
     if options.recipe:
         refuse(options, ["format", "read"], "is said by the recipe: write it there")
-    if options.served and not options.served.startswith(("http://", "https://")):
-        raise UsageError(f"--served is {options.served!r}, expected an address with http or https")
     register_formats(options)
     recipe = Recipe.load(options.recipe) if options.recipe else None
     home = options.recipe.parent if options.recipe else None
@@ -118,6 +117,8 @@ def scan(options: Options) -> int:
         report(f"reading {options.logs}", [])
         form = options.format or ""
         logs = read_logs(options.logs, recipe, form, dict(options.read), options.window, home)
+        if options.served and not (options.mcap or logs.form == "mcap"):
+            raise UsageError("--served is for MCAP: expected --mcap FILE, or logs that are MCAP")
         parameters = parameters_by_detector([options.detector], dict(options.param))
         result = scan_episodes(
             logs.episodes,
@@ -133,7 +134,11 @@ def scan(options: Options) -> int:
             progress=report,
             ledger=logs.ledger,
         )
-    drop, keep = _lists(result)
+    names = {_recording(scanned.episode): False for scanned in result.episodes}
+    names |= {_recording(scanned.episode): True for scanned in result.odd}
+    drop = [name for name, is_odd in names.items() if is_odd]
+    keep = [name for name, is_odd in names.items() if not is_odd]
+    link = partial(_link, options)
     console = make_console()
     if not quiet:
         _print_table(result, options, console)
@@ -141,19 +146,18 @@ def scan(options: Options) -> int:
     console.print(Text(summary(result)))
     for note, code in _next_steps(result, logs, drop, options) if not quiet else ():
         print_prose(note, console)
-        if code:
-            console.print(Text(f"  {code}"))
-    for file, names in ((options.keep, keep), (options.drop, drop)):
-        if file:
-            write_text(file, _listed(names, as_json=file.suffix == ".json"))
+        console.print(Text(f"  {code}"))
+    for file, listed in ((options.keep, keep), (options.drop, drop)):
+        if file and file.suffix == ".json":
+            write_text(file, json.dumps(_numbers(listed) or listed) + "\n")
+        elif file:
+            write_text(file, "".join(f"{name}\n" for name in listed))
     if options.json:
         write_text(options.json, json.dumps(result.as_json(), indent=1, allow_nan=False) + "\n")
     if options.html:
         title = options.logs.resolve().name
-        link = _link(logs, options)
-        write_text(
-            options.html, page(result, title, first=options.first, link=link, notes=logs.notes)
-        )
+        text = page(result, title, first=options.first, link=link, notes=logs.notes)
+        write_text(options.html, text)
     if options.rerun:
         write_rerun(result, options.rerun, options.first)
     if options.mcap:
@@ -167,10 +171,9 @@ def _check_outputs(options: Options, recipe: Recipe | None) -> None:
     if not outputs:
         return
     form = recipe.format if recipe else options.format or ""
-    inputs = [*recognised(options.logs, form)[1]]
-    inputs += [Path(options.fine)] if Path(options.fine).is_file() else []
-    for root in filter(None, (options.logs, options.recipe and options.recipe.parent)):
-        inputs += files_of(recipe, root) if recipe else ()
+    inputs = [*recognised(options.logs, form)[1], *filter(Path.is_file, [Path(options.fine)])]
+    if recipe:
+        inputs += [*files_of(recipe, options.logs), *files_of(recipe, options.recipe.parent)]
     for name, path in outputs.items():
         refuse_inputs(path, inputs, f"--{name}")
     refuse_logs(outputs.values(), options.logs, form)
@@ -205,30 +208,16 @@ def _confirmed(text: str, names: Sequence[str]) -> list[str]:
     return [*confirmed]
 
 
-def _lists(result: Scan) -> tuple[list[str], list[str]]:
-    """Return the names of recordings with an odd piece, and of the others, in recorded order."""
-    odd = {_recording(scanned.episode) for scanned in result.odd}
-    names = dict.fromkeys(_recording(scanned.episode) for scanned in result.episodes)
-    return [name for name in names if name in odd], [name for name in names if name not in odd]
-
-
 def _recording(episode: Episode) -> str:
     """Return the name of the recording that an episode is a piece of."""
-    name, _, number = episode.name.rpartition("#")
-    return name if name and number.isdigit() else episode.name
+    is_whole = Path(episode.source).stem == episode.name
+    return episode.name if is_whole else re.sub(r"#\d+$", "", episode.name)
 
 
-def _listed(names: Sequence[str], *, as_json: bool) -> str:
-    """Return a name a line or, as JSON, a list, of numbers where data sets number episodes."""
-    if not as_json:
-        return "".join(f"{name}\n" for name in names)
-    numbers = [_number(name) for name in names]
-    return json.dumps(names if min(numbers, default=0) < 0 else numbers) + "\n"
-
-
-def _number(name: str) -> int:
-    """Return the number of ``episode_000012``; -1 for other names."""
-    return natural(name.removeprefix("episode_")) if name.startswith("episode_") else -1
+def _numbers(names: Sequence[str]) -> list[int]:
+    """Return the numbers of episodes of data sets that number them; none for other names."""
+    matches = [re.fullmatch(r"episode_(\d{1,9})", name) for name in names]
+    return [int(match[1]) for match in matches if match] if all(matches) else []
 
 
 def _print_table(result: Scan, options: Options, console: Console) -> None:
@@ -239,25 +228,14 @@ def _print_table(result: Scan, options: Options, console: Console) -> None:
         if scanned.place <= options.first or scanned.band != "fine" or options.verbosity > 0
     ]
     titles, rows = table_of(listed)
-    marks = [WORDS[scanned.band] for scanned in listed]
     # Names may have line breaks.
-    cells = [[mark, *(" ".join(cell.split()) for cell in row)]
-             for mark, row in zip(marks, rows, strict=True)]  # fmt: skip
+    cells = [[" ".join(cell.split()) for cell in (WORDS[scanned.band], *row)]
+             for scanned, row in zip(listed, rows, strict=True)]  # fmt: skip
     head = ["", *titles]
     align = ["right" if title in NUMBERS else "left" for title in head]
-    widths: list[int | None] = [None] * len(head)
-    if "reason" in head:
-        others = [i for i, title in enumerate(head) if title != "reason"]
-        taken = sum(2 + max(len(row[i]) for row in [head, *cells]) for i in others)
-        widths[head.index("reason")] = max(_NARROWEST, console.width - taken)
-    table = tabulate(
-        cells, head, "simple", disable_numparse=True, colalign=align, maxcolwidths=widths
-    )
-    style = ""
-    bands = iter(listed)
-    for number, line in enumerate(table.splitlines()):
-        if number > 1 and not line.startswith(" "):
-            style = _STYLES[next(bands).band]
+    table = tabulate(cells, head, "simple", disable_numparse=True, colalign=align)
+    styles = ["", "", *(_STYLES[scanned.band] for scanned in listed)]
+    for line, style in zip(table.splitlines(), styles, strict=True):
         console.print(Text(line.rstrip(), style))
     console.print("")
     if left := len(result.episodes) - len(listed):
@@ -284,41 +262,39 @@ def _print_notes(result: Scan, logs: RecordedLogs, console: Console) -> None:
 def _next_steps(
     result: Scan, logs: RecordedLogs, drop: Sequence[str], options: Options
 ) -> Iterator[tuple[str, str]]:
-    """Yield what a person would do next, a sentence each, with a command or an address."""
+    """Yield what a person would do next, each with a command or what to look at."""
     suspicious = [scanned for scanned in result.ranked if scanned.band != "fine"]
     if not suspicious:
         return
     first = suspicious[0]
     at = "" if first.first is None else f" from row {first.first}"
-    sensors = f" ({', '.join(first.suspects[:3])})" if first.suspects else ""
-    drawn = "" if options.html else "; --html FILE draws it"
-    yield f"Next: look at {first.episode.name}{at}{sensors}{drawn}.", _link(logs, options)(first)
+    link = _link(options, first) or ("" if options.html else "--html FILE draws it")
+    yield f"Next, look at {first.episode.name}{at}: {first.reason}.", link
     if options.rerun:
         yield "Rerun opens a tab for each of the first:", shlex.join(["rerun", str(options.rerun)])
     unsure = [s.episode.name for s in suspicious if not s.odd] or [first.episode.name]
+    names = shlex.quote(",".join(unsure[:3]))
     yield (
-        "Episodes that turn out to be fine make the others' ranks exact, from 20 on:",
-        f"--fine {shlex.quote(','.join(unsure[:3]))}",
+        "Say which are fine; from 20 on they make the ranks of the others exact:",
+        f"--fine {names}",
     )
     if drop and logs.form == "lerobot":
-        indices = shlex.quote(json.dumps([_number(name) for name in drop]))
+        indices = shlex.quote(json.dumps(_numbers(drop)))
         root = f"--root {shlex.quote(str(options.logs))} --repo_id NAME --new_repo_id NEW"
         operation = f"--operation.type delete_episodes --operation.episode_indices {indices}"
-        yield "Delete the odd ones, into a new one:", f"lerobot-edit-dataset {root} {operation}"
+        yield (
+            "Delete the odd ones, into a new data set:",
+            f"lerobot-edit-dataset {root} {operation}",
+        )
     elif drop and not options.drop:
-        yield "--drop FILE writes the names of the odd ones, --keep FILE those of the others.", ""
+        yield "Write the names of the odd ones, and of the others:", "--drop FILE --keep FILE"
 
 
-def _link(logs: RecordedLogs, options: Options) -> Any:
-    """Return a function of an episode: its link to Foxglove, empty where nothing is served."""
-
-    def link(scanned: ScannedEpisode) -> str:
-        if not options.served:
-            return ""
-        file = options.mcap.name if options.mcap else ""
-        if not file and logs.form == "mcap":
-            root = options.logs if options.logs.is_dir() else options.logs.parent
-            file = Path(scanned.episode.source).relative_to(root).as_posix()
-        return foxglove_link(scanned, f"{options.served.rstrip('/')}/{quote(file)}") if file else ""
-
-    return link
+def _link(options: Options, scanned: ScannedEpisode) -> str:
+    """Return a link that opens an episode in Foxglove; empty where nothing is served."""
+    if not options.served:
+        return ""
+    root = options.logs if options.logs.is_dir() else options.logs.parent
+    file = Path(options.mcap or scanned.episode.source)
+    name = file.name if options.mcap else file.relative_to(root).as_posix()
+    return foxglove_link(scanned, f"{options.served.rstrip('/')}/{quote(name)}")

@@ -7,6 +7,7 @@ reader's system is.
 import html
 import math
 from collections.abc import Callable, Sequence
+from importlib.resources import files
 from typing import Final
 
 import numpy as np
@@ -40,32 +41,7 @@ _LEGEND: Final = (
     "In the pictures the vertical line is the odd row, the band holds the middle nine tenths of "
     "the other episodes at the same row, and shaded are rows with a statistic above the threshold."
 )
-_STYLE: Final = """
-:root { color-scheme: light dark; --text: #1b1f24; --dim: #5a6472; --ground: #fff; --line: #d9dee5;
-  --curve: #0b62a8; --odd: #b3261e; --look: #8a5a00; --shade: #b3261e22; --usual: #5a647230; }
-@media (prefers-color-scheme: dark) { :root { --text: #e6e9ee; --dim: #9aa5b3; --ground: #15181c;
-  --line: #343b45; --curve: #6db3f2; --odd: #ff8a80; --look: #f2b84b; --shade: #ff8a8026;
-  --usual: #9aa5b338; } }
-* { box-sizing: border-box; }
-body { margin: 0 auto; padding: 1.5rem 1rem 4rem; max-width: 60rem; color: var(--text);
-  background: var(--ground); font: 15px/1.5 system-ui, sans-serif; overflow-wrap: anywhere; }
-h1 { font-size: 1.5rem; margin: 0 0 .5rem; } h2 { font-size: 1.2rem; margin: 2.2rem 0 .3rem; }
-h3 { font-size: 1rem; margin: 1.4rem 0 .2rem; } p { margin: .3rem 0; }
-.dim { color: var(--dim); } a { color: var(--curve); }
-.wide { overflow-x: auto; margin-top: .6rem; }
-table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; }
-th, td { padding: .25rem .6rem; text-align: left; border-bottom: 1px solid var(--line);
-  vertical-align: top; white-space: nowrap; }
-td.words { white-space: normal; min-width: 9rem; } th { color: var(--dim); font-weight: 600; }
-.number { text-align: right; } .odd { color: var(--odd); } .look { color: var(--look); }
-td.odd, td.look { font-weight: 600; }
-svg { display: block; width: 100%; min-width: 36rem; height: auto; }
-svg text { fill: var(--dim); font: 12px system-ui, sans-serif; } svg .name { fill: var(--text); }
-svg .frame { fill: none; stroke: var(--line); } svg .shade { fill: var(--shade); }
-svg .usual { fill: var(--usual); } svg .first { stroke: var(--odd); }
-svg .curve { fill: none; stroke: var(--curve); stroke-width: 1.3; stroke-linejoin: round; }
-svg .limit { stroke: var(--odd); stroke-dasharray: 5 4; }
-"""
+_STYLE: Final = files("oodd_logs.scanning") / "scan_page.css"
 
 
 def page(
@@ -101,7 +77,7 @@ def page(
     head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width">'
     text = [
         f'<!doctype html><html lang="en"><head>{head}<title>{heading}</title>',
-        f"<style>{_STYLE}</style></head><body><h1>{heading}</h1>",
+        f"<style>{_STYLE.read_text('utf-8')}</style></head><body><h1>{heading}</h1>",
         f"<p><strong>{summary(scan)}</strong> Judged by {html.escape(scan.judge)}.</p>",
         *(f'<p class="dim">{html.escape(remark)}</p>' for remark in (*notes, *scan.notes)),
         f'<p class="dim">{_LEGEND}</p>',
@@ -245,36 +221,34 @@ def _panel(
     def y(value: float) -> float:
         return bottom - 4 - (_HEIGHT - 8) * (value - low) / (high - low)
 
-    def points(curve: Floats, start: int, stop: int) -> list[str]:
-        return [f"{x(begin + r):.1f},{y(v):.1f}" for r, v in _thinned(curve, start, stop)]
+    def points(curve: Floats, start: int, stop: int) -> list[tuple[float, float]]:
+        return [(x(begin + r), y(v)) for r, v in _thinned(curve, start, stop)]
+
+    def path(kind: str, *corners: tuple[float, float]) -> str:
+        d = " ".join(f"{a:.1f},{b:.1f}" for a, b in corners)
+        return f'<path class="{kind}" d="M{d}"/>'
 
     def text(at: float, line: float, content: str, more: str = 'text-anchor="end"') -> str:
         return f'<text x="{at}" y="{line}" {more}>{html.escape(content)}</text>'
 
-    def line(kind: str, x1: float, y1: float, x2: float, y2: float) -> str:
-        return f'<line class="{kind}" x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}"/>'
-
-    def box(kind: str, start: float, stop: float) -> str:
-        size = f'width="{max(1.0, stop - start):.1f}" height="{_HEIGHT}"'
-        return f'<rect class="{kind}" x="{start:.1f}" y="{top}" {size}/>'
+    def box(kind: str, left: float, stop: float) -> str:
+        return path(kind, (left, top), (stop, top), (stop, bottom), (left, bottom), (left, top))
 
     parts = [
-        box("shade", x(a), x(b - 1))
+        box("shade", x(a), max(x(a) + 1, x(b - 1)))
         for start, stop in scanned.intervals
         if (a := max(start, begin)) < (b := min(stop, end))
     ]
     parts.append(box("frame", _LEFT, right))
-    for run in runs_of(np.isfinite(band[0] + band[1])):
-        outline = " ".join([*points(band[1], *run), *points(band[0], *run)[::-1]])
-        parts.append(f'<polygon class="usual" points="{outline}"/>')
     parts += [
-        f'<polyline class="curve" points="{" ".join(points(visible, *run))}"/>'
-        for run in runs_of(np.isfinite(visible))
+        path("usual", *points(band[1], *run), *points(band[0], *run)[::-1])
+        for run in runs_of(np.isfinite(band[0] + band[1]))
     ]
+    parts += [path("curve", *points(visible, *run)) for run in runs_of(np.isfinite(visible))]
     if scanned.first is not None and scanned.first in span:
-        parts.append(line("first", x(scanned.first), top, x(scanned.first), bottom))
+        parts.append(path("first", (x(scanned.first), top), (x(scanned.first), bottom)))
     if math.isfinite(limit):
-        parts.append(line("limit", _LEFT, y(limit), right, y(limit)))
+        parts.append(path("limit", (_LEFT, y(limit)), (right, y(limit))))
         parts.append(text(right, top - 5, f"dashed: threshold {figure(limit)}"))
     parts.append(text(_LEFT, top - 5, name, 'class="name"'))
     parts += [text(_LEFT - 6, top + 12, figure(high)), text(_LEFT - 6, bottom - 4, figure(low))]

@@ -16,6 +16,7 @@ from oodd_logs.scanning.scan import Scan, ScannedEpisode
 
 _EXTRA: Final = "pip install 'oodd-eval[viewers]'"
 _AROUND: Final = 100  # rows before and after the odd one that a tab of Rerun shows
+_CURVES: Final = [["statistic"], ["threshold"]]
 _NUMBER: Final = {"type": ["number", "null"]}
 _VERDICT: Final = {
     "score": _NUMBER,
@@ -99,30 +100,29 @@ def write_rerun(scan: Scan, path: Path, first: int = 10) -> None:
 
 
 def _tab(scanned: ScannedEpisode, name: str) -> Any:
-    """Return views of the suspects and the statistic of an episode, about its first odd row."""
+    """Return curves of the suspects and the statistic of an episode, about its first odd row."""
     import rerun as rr  # noqa: PLC0415
 
-    views, ranges, time = rr.blueprint, [], scanned.episode.time
-    if (row := scanned.first) is not None:
-        ends = [max(0, row - _AROUND), min(len(scanned.scores) - 1, row + _AROUND)]
-        boundaries = {"row": [rr.TimeRangeBoundary.absolute(seq=end) for end in ends]}
-        if time is not None and np.isfinite(time[ends]).all():
-            seconds = time[ends].tolist()
-            boundaries["time"] = [rr.TimeRangeBoundary.absolute(seconds=end) for end in seconds]
-        ranges = [
-            rr.VisibleTimeRange(timeline, start=start, end=end)
-            for timeline, (start, end) in boundaries.items()
-        ]
-
-    def view(title: str, *entities: list[str]) -> Any:
-        paths = [rr.new_entity_path([name, *entity]) for entity in entities]
-        return views.TimeSeriesView(
-            origin=rr.new_entity_path([name]), contents=paths, name=title, time_ranges=ranges
-        )
-
+    row, last, time = scanned.first, len(scanned.scores) - 1, scanned.episode.time
+    ends = [0, last] if row is None else [max(0, row - _AROUND), min(last, row + _AROUND)]
+    spans = {"row": ("seq", ends)}
+    if time is not None and np.isfinite(time[ends]).all():
+        spans["time"] = ("seconds", time[ends].tolist())
+    edge: Any = rr.TimeRangeBoundary.absolute
+    ranges = [
+        rr.VisibleTimeRange(timeline, start=edge(**{unit: start}), end=edge(**{unit: stop}))
+        for timeline, (unit, (start, stop)) in spans.items()
+    ]
     suspects = [["sensors", sensor] for sensor in scanned.suspects or scanned.sensors]
-    statistic = view("statistic", ["statistic"], ["threshold"])
-    return views.Vertical(view("suspects", *suspects), statistic, name=name)
+    views = [
+        rr.blueprint.TimeSeriesView(
+            contents=[rr.new_entity_path([name, *entity]) for entity in entities],
+            name=title,
+            time_ranges=ranges,
+        )
+        for title, entities in {"suspects": suspects, "verdict": _CURVES}.items()
+    ]
+    return rr.blueprint.Vertical(*views, name=name)
 
 
 def write_mcap(scan: Scan, path: Path) -> None:
