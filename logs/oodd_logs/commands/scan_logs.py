@@ -146,7 +146,8 @@ def scan(options: Options) -> int:
     console.print(Text(summary(result)))
     for note, code in _next_steps(result, logs, drop, options) if not quiet else ():
         print_prose(note, console)
-        console.print(Text(f"  {code}"))
+        if code:
+            console.print(Text(f"  {code}"))
     for file, listed in ((options.keep, keep), (options.drop, drop)):
         if file and file.suffix == ".json":
             write_text(file, json.dumps(_numbers(listed) or listed) + "\n")
