@@ -13,4 +13,5 @@ def _open(path: Path, options: Options) -> Iterator[Recording]:
     yield table_recording(path, options)
 
 
-READER: Final = Reader("csv", "a CSV file", (".csv", ".tsv"), _open, options=OPTIONS)
+_ENDINGS: Final = (".csv", ".tsv", ".csv.gz", ".tsv.gz")
+READER: Final = Reader("csv", "a CSV file", _ENDINGS, _open, options=OPTIONS)

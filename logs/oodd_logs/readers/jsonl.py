@@ -1,6 +1,5 @@
 """Recordings as lines of JSON, packed by gzip or not: an object an episode, or an object a row."""
 
-import gzip
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -14,13 +13,14 @@ from oodd_logs.ledger import Ledger
 from oodd_logs.readers import Options, Reader, unreadable
 from oodd_logs.readers.gathered import Gathered
 from oodd_logs.readers.matrices import MatrixRows, episode_of
+from oodd_logs.readers.packed import open_bytes, stem
 from oodd_logs.recording import Recording, Topic
 
 _LINE: Final = EPISODE.most // 4  # bytes
 
 
 def _open(path: Path, _options: Options) -> Iterator[Recording]:
-    name = path.name.removesuffix(".gz").rpartition(".")[0] or path.name
+    name = stem(path)
     rows = Gathered(str(path))
     for i, (line, value) in enumerate(_objects(path)):
         source = f"{path}, line {line}"
@@ -36,10 +36,7 @@ def _open(path: Path, _options: Options) -> Iterator[Recording]:
 
 def _objects(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
     """Yield the objects of a file with the numbers of their lines."""
-    with path.open("rb") as raw:
-        packed = raw.read(2) == b"\x1f\x8b"
-        raw.seek(0)
-        file = gzip.GzipFile(fileobj=raw) if packed else raw
+    with open_bytes(path) as file:
         for number, line in enumerate(iter(lambda: file.readline(_LINE + 1), b""), start=1):
             if len(line) > _LINE:
                 raise EPISODE.failure(f"{path}, line {number} has more than {_LINE} bytes")

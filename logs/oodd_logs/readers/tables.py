@@ -23,6 +23,7 @@ from oodd_logs.kinds.number_marks import MARKS, has_thousands, may_have_thousand
 from oodd_logs.ledger import Ledger
 from oodd_logs.readers import TRANSPOSE, Options, is_transposed
 from oodd_logs.readers.cells import check_width, column_names, number, numbers, texts
+from oodd_logs.readers.packed import open_bytes, open_text, read_text, stem
 from oodd_logs.recording import Column, Recording, Topic
 
 BLANKS: Final = " "
@@ -116,7 +117,7 @@ def table_recording(path: Path, options: Options, separator: str = "") -> Record
         if layout.units:
             said = f"units of the columns, it seems: {', '.join(layout.units)}"[:200]
             ledger.add("row", "changed", f"{said} ([read] units = false keeps the line as a row)")
-    return Recording(path.stem, str(path), {"": topic}, ledger=ledger)
+    return Recording(stem(path), str(path), {"": topic}, ledger=ledger)
 
 
 def _table(path: Path, layout: Layout, ledger: Ledger) -> dict[str, Column]:
@@ -181,9 +182,7 @@ def _column(cells: list[str], name: str, layout: Layout, ledger: Ledger) -> Colu
 def _transposed(path: Path, options: Options, separator: str) -> Topic:
     """Return a file as a topic of which each line is a column, perhaps with its name in front."""
     encoding = _encoding(path, options)
-    if path.stat().st_size > EPISODE.most // 4:
-        raise EPISODE.failure(f"{path} has more than {EPISODE.most // 4} bytes and is transposed")
-    lines = path.read_text(encoding).splitlines()[_whole(options, "skip") :]
+    lines = read_text(path, encoding).splitlines()[_whole(options, "skip") :]
     lines = [line for line in lines if line.strip() and not line.startswith("#")]
     mark = _separator(lines[:_SAMPLE], options, separator)
     decimal = _decimal(_split(lines[:_SAMPLE], mark), mark, options)
@@ -205,7 +204,7 @@ def _transposed(path: Path, options: Options, separator: str) -> Topic:
 def layout_of(path: Path, options: Options, separator: str = "") -> Layout:
     """Return the layout of a file, recognised from its first lines as far as options leave it."""
     encoding = _encoding(path, options)
-    with path.open(encoding=encoding) as text:
+    with open_text(path, encoding) as text:
         raw = []
         for line in iter(lambda: _line(text, path), ""):
             raw.append(_without_zeros(line, Ledger()))
@@ -302,7 +301,7 @@ def _columns(
 
 
 def _blocks(path: Path, layout: Layout, ledger: Ledger) -> Iterator["_Block"]:
-    with path.open(encoding=layout.encoding) as file:
+    with open_text(path, layout.encoding) as file:
         for _ in range(line := layout.lines):
             _line(file, path)
         last = False
@@ -442,7 +441,7 @@ def _encoding(path: Path, options: Options) -> str:
         raise UsageError(
             f"encoding is {encoding!r}, expected one such as utf-8 or cp1252"
         ) from None
-    with path.open("rb") as file:
+    with open_bytes(path) as file:
         head = file.read(4096)
     if head.startswith((b"\xff\xfe", b"\xfe\xff")):
         return "utf-16"

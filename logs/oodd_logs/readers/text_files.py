@@ -7,10 +7,11 @@ from typing import Final
 
 import numpy as np
 
-from oodd_eval.data.bounded import EPISODE, LINE_CHARACTERS
+from oodd_eval.data.bounded import LINE_CHARACTERS
 from oodd_eval.errors import TrajectoryError
 from oodd_logs.readers import Options, Reader, is_transposed
 from oodd_logs.readers.cells import column_names, numbers
+from oodd_logs.readers.packed import open_text, read_text, stem
 from oodd_logs.readers.tables import BLANKS, OPTIONS, layout_of, table_recording
 from oodd_logs.recording import Recording, Topic
 
@@ -25,7 +26,7 @@ def _open(path: Path, options: Options) -> Iterator[Recording]:
 def _has_classes(path: Path, options: Options) -> bool:
     """Tell whether a single word stands above the first row of several numbers."""
     layout = layout_of(path, {k: v for k, v in options.items() if k != "names"}, BLANKS)
-    with path.open(encoding=layout.encoding) as text:
+    with open_text(path, layout.encoding) as text:
         lines = [text.readline(LINE_CHARACTERS + 1) for _ in range(layout.lines + 1)]
     width = len(lines[-1].split())
     return layout.lines > 0 and len(layout.names) == 1 < width and _row(lines[-1]) is not None
@@ -33,10 +34,8 @@ def _has_classes(path: Path, options: Options) -> bool:
 
 def _blocks(path: Path, options: Options) -> Iterator[Recording]:
     """Yield blocks of rows, each below a line with its class, which is a field."""
-    if path.stat().st_size > EPISODE.most // 4:
-        raise EPISODE.failure(f"{path} has more than {EPISODE.most // 4} bytes")
     label, count = "", 0
-    lines = path.read_text(layout_of(path, {}, BLANKS).encoding).splitlines()
+    lines = read_text(path, layout_of(path, {}, BLANKS).encoding).splitlines()
     parsed = ((line, _row(line)) for line in lines if line.strip())
     for is_label, group in itertools.groupby(parsed, lambda pair: pair[1] is None):
         if is_label:
@@ -49,7 +48,7 @@ def _blocks(path: Path, options: Options) -> Iterator[Recording]:
         if len(names) != len(rows[0]):
             raise TrajectoryError(f"{source} has {len(rows[0])} columns, expected {len(names)}")
         topic = Topic.of(dict(zip(names, np.array(rows).T, strict=True)))
-        yield Recording(f"{path.stem}-{count}", source, {"": topic}, {"class": label})
+        yield Recording(f"{stem(path)}-{count}", source, {"": topic}, {"class": label})
         count += 1
 
 
@@ -58,6 +57,5 @@ def _row(line: str) -> list[float] | None:
     return column.tolist() if column is not None and len(column) else None
 
 
-READER: Final = Reader(
-    "text", "a text file of numbers", (".dat", ".data", ".txt"), _open, options=OPTIONS
-)
+_ENDINGS: Final = (".dat", ".data", ".txt", ".dat.gz", ".data.gz", ".txt.gz")
+READER: Final = Reader("text", "a text file of numbers", _ENDINGS, _open, options=OPTIONS)
