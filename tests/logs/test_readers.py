@@ -1079,7 +1079,7 @@ def test_a_damaged_ulog_file_is_told(tmp_path, capsys):
 
 def test_a_format_says_by_what_it_is_recognised():
     known = readers()
-    assert {*known} == {"csv", "text", "jsonl", "parquet", "lerobot", "mcap", "rosbag", "ulog",
+    assert {*known} == {"csv", "text", "json", "jsonl", "parquet", "lerobot", "mcap", "rosbag", "ulog",
                         "mat", "hdf5", "numpy", "minari"}  # fmt: skip
     endings = [suffix for reader in known.values() for suffix in reader.suffixes]
     assert len(endings) == len({*endings})

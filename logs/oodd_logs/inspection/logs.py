@@ -582,7 +582,8 @@ def recognised(path: Path, form: str) -> tuple[Reader, list[Path], Counter[str]]
             f"{str(path)!r} has no files of a known format, expected names that end in {endings}; "
             "--format says which it is"
         )
-    name = max(by_reader, key=lambda reader: len(by_reader[reader]))
+    # Beside logs, JSON files hold settings.
+    name = max(by_reader, key=lambda reader: (reader != "json", len(by_reader[reader])))
     left_out = {*files} - {*by_reader[name]}
     return formats[name], by_reader[name], Counter(file.suffix for file in left_out)
 

@@ -16,7 +16,8 @@ from oodd_logs.readers.matrices import MatrixRows, episode_of
 from oodd_logs.readers.packed import open_bytes, stem
 from oodd_logs.recording import Recording, Topic
 
-_LINE: Final = EPISODE.most // 4  # bytes
+LINE: Final = EPISODE.most // 4
+"""Bytes of a line, at most."""
 
 
 def _open(path: Path, _options: Options) -> Iterator[Recording]:
@@ -37,9 +38,9 @@ def _open(path: Path, _options: Options) -> Iterator[Recording]:
 def _objects(path: Path) -> Iterator[tuple[int, dict[str, Any]]]:
     """Yield the objects of a file with the numbers of their lines."""
     with open_bytes(path) as file:
-        for number, line in enumerate(iter(lambda: file.readline(_LINE + 1), b""), start=1):
-            if len(line) > _LINE:
-                raise EPISODE.failure(f"{path}, line {number} has more than {_LINE} bytes")
+        for number, line in enumerate(iter(lambda: file.readline(LINE + 1), b""), start=1):
+            if len(line) > LINE:
+                raise EPISODE.failure(f"{path}, line {number} has more than {LINE} bytes")
             if not line.strip():
                 continue
             try:
