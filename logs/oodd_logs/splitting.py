@@ -137,7 +137,7 @@ def split_recording(
     topics = {**recording.topics, main: dataclasses.replace(marked, names=names)}
     topics = {name: _held(topic, rows[name]) for name, topic in topics.items()}
     for i, episode in enumerate(episodes):
-        ended = [bool(v) for name, v in episode.fields.items() if plain_name(name) in TERMINAL]
+        ended = [bool(v) for name, v in episode.fields.items() if last_part(name) in TERMINAL]
         terminated = {"terminated": any(ended)} if ended else {}
         yield dataclasses.replace(
             recording,
@@ -213,8 +213,8 @@ def kind_of(name: str, starts: _Rows, values: Column, rows: int) -> _Kind:
         return "key"
     distinct = np.unique(values[np.isfinite(values)])
     if {*distinct.tolist()} <= {0.0, 1.0}:
-        if plain_name(name) in BEGINS | ENDS:
-            return "begins" if plain_name(name) in BEGINS else "ends"
+        if last_part(name) in BEGINS | ENDS:
+            return "begins" if last_part(name) in BEGINS else "ends"
         lengths = np.diff(np.append(starts, rows))
         if lengths[values == 1].max(initial=0) == 1 < lengths.max():
             return "begins" if values[0] == 1 else "ends"
@@ -226,7 +226,7 @@ def kind_of(name: str, starts: _Rows, values: Column, rows: int) -> _Kind:
     return "counter" if counts and rising >= _STEADY * (rows - 1) else "key"
 
 
-def plain_name(name: str) -> str:
+def last_part(name: str) -> str:
     """Return the last part of a name, in lower case: ``done`` of ``next.done``."""
     return re.split(r"[./:]", name)[-1].strip().lower()
 

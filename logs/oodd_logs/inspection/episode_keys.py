@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from oodd_logs.inspection.columns import parse_dates
 from oodd_logs.recording import Column, Recording, Topic
-from oodd_logs.splitting import BEGINS, COUNTS, ENDS, plain_name
+from oodd_logs.splitting import BEGINS, COUNTS, ENDS, last_part
 
 _CELLS: Final = 1 << 20  # that are looked at
 _SHORTEST: Final = 8  # rows of an episode, in the mean
@@ -127,7 +127,7 @@ def _partner(sample: Mapping[str, Column], name: str, changes: _Mask) -> list[st
 def _flags(topic: Topic) -> list[str]:
     """Return flags of last rows, else of first ones."""
     for names in (ENDS, BEGINS):
-        columns = [name for name in topic.names if plain_name(name) in names]
+        columns = [name for name in topic.names if last_part(name) in names]
         cells = topic.read(columns, 0, topic.rows) if columns else {}
         set_before_end = [n for n, x in cells.items() if _is_flag(x) and (x[1:-1] == 1).any()]
         if set_before_end:
