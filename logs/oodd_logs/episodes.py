@@ -25,7 +25,7 @@ from oodd_eval.metrics.faults import FAR
 from oodd_eval.names import check_known, counted
 from oodd_logs.kinds import Matrix
 from oodd_logs.ledger import Item, Ledger
-from oodd_logs.marks import AnomalousRows, IntervalList, merged, rows_of
+from oodd_logs.marks import AnomalousRows, IntervalList, LabelValues, merged, rows_of
 from oodd_logs.readers import in_order as natural_order
 from oodd_logs.recipe import FAILURE, AnomalousFiles, Recipe, anomaly_name
 from oodd_logs.recorded import FILES, NOMINAL_ROLES, SLOWER, Recorded, StampedRows, text_of
@@ -479,6 +479,10 @@ class _Reading:
     problems: list[str] = field(default_factory=list)
     failures: list[Exception] = field(default_factory=list)  # of what a scan leaves out
     cut_by_outcome: set[str] = field(default_factory=set)  # parts with windows without a label
+    label_values: LabelValues = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.label_values = LabelValues(self.recipe)
 
     @property
     def recordings(self) -> int:
@@ -535,6 +539,7 @@ def _add(reading: _Reading, recorded: Recorded) -> None:
                 number,
             )
             _keep(reading, facts, label)
+    reading.label_values.merge(stamped.labels)
     for text in recipe.label_columns:
         if text not in selection.labels and (text in recipe.labels or recorded.kinds):
             ledger.add("recording", "kept", f"has no column {text!r}: rows count as nominal")
@@ -755,12 +760,14 @@ def _parts_of(
     matching = [f"test/{name}" for name in sorted(kinds) if labelled & {"", name}]
     if not matching and nominal and not is_piece:
         start, stop, _ = inside[0]
-        raise TrajectoryError(
+        # Raised at the end, as labels may say otherwise than the recipe takes it.
+        reading.problems.append(
             f"{source} is listed as nominal, but is anomalous in rows {max(start, 0)} to "
             f"{stop - 1}: list it under [anomalous.NAME], or cut it with window, so that the "
             "windows without anomalous rows are nominal; labels of nominal rows other than 0, "
             "false, H or nothing are named by nominal_label"
         )
+        return []
     if not matching:
         leave_out("episode", "windows with anomalous rows, of nominal files")
     return matching
@@ -791,10 +798,11 @@ def _keep(reading: _Reading, facts: EpisodeFacts, label: str) -> None:
     baseline = 0 if reading.every else reading.recipe.baseline
     if early := [start for start, _ in facts.intervals if 0 <= start < baseline]:
         if "#" not in facts.name:
-            raise TrajectoryError(
+            reading.problems.append(
                 f"{facts.source} is anomalous from row {early[0]} on, expected its first "
                 f"{baseline} rows (baseline) to be nominal"
             )
+            return
         reason = "windows that are anomalous within their baseline"
         reading.ledger.add("episode", "dropped", reason, source=label)
         return
@@ -812,6 +820,8 @@ def _in_parts(reading: _Reading) -> EpisodeSource:
         if reading.by_stamps:
             source.parts[EVERY].sort(key=lambda facts: facts.begin)
         _say_far(source)
+        for text, problem in reading.label_values.problems():
+            reading.ledger.add("column", "kept", problem, name=text)
         return source
     if reading.first is None:
         raise UsageError("there are no recordings to read, expected at least one")
@@ -820,6 +830,8 @@ def _in_parts(reading: _Reading) -> EpisodeSource:
     for text in (text for text in recipe.label_columns if text not in labelled):
         columns = {name for layout in selections for name in named_columns(layout)}
         raise UnknownNameError("column with labels", text, columns)
+    for _, problem in reading.label_values.problems():
+        raise UsageError(problem)
     for problem in reading.problems:
         raise TrajectoryError(problem)
     parts = _shared_out(reading)

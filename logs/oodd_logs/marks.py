@@ -7,11 +7,14 @@ rows of an episode.
 import csv
 import io
 import itertools
+import json
 import math
-from collections.abc import Iterable, Sequence
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +24,28 @@ from oodd_eval.errors import TrajectoryError, UnknownNameError
 from oodd_eval.names import is_plain, natural
 from oodd_logs.recipe import Interval, Recipe
 from oodd_logs.recording import Column
+from oodd_logs.selecting import split_unit
 
 NOMINAL_LABELS: Final = ("", "0", "0.0", "false", "h")
 """Labels of nominal rows, regardless of case, unless a recipe names others; so is the number 0."""
 
+NOMINAL_WORDS: Final = re.compile(
+    r"(?:^|[^a-z])(?:nominal|normal|healthy|good|free|baseline|reference|no[^a-z]?(?:fault|failure|anomal\w*))"
+    r"(?:$|[^a-z])",
+    re.IGNORECASE,
+)
+"""Words of nominal files, values and labels."""
+
+SAYS_NOMINAL: Final = re.compile(
+    r"(?:is[_ ]?)?(?:healthy|normal|nominal|ok|good|inlier|valid|pass|passed|success)",
+    re.IGNORECASE,
+)
+"""Whole names of labels that are true of nominal rows."""
+
+_SHORT: Final = frozenset({"h", "0", "n", "ok", "pass", "passed", "inlier", "none", "no"})
+_TRUE: Final = frozenset({"1", "1.0", "true", "yes", "y"})
+_KEPT: Final = 64  # labels of a column that are counted
+_CLEAR: Final = 0.6  # share of rows from which on a label is that of the majority
 _BYTES: Final = 10**7  # of a list of intervals
 
 
@@ -72,6 +93,109 @@ def anomalous_cells(values: Column, recipe: Recipe, *, before: bool) -> NDArray[
     present = np.where(np.isnan(values), -1, np.arange(len(values)))
     held = np.maximum.accumulate(present)
     return np.asarray(np.where(held < 0, before, ~np.isin(values, numbers)[held]), bool)
+
+
+class LabelValues:
+    """Cells of the label columns that were read, and what is amiss with them as labels.
+
+    Parameters
+    ----------
+    recipe
+        Its `nominal_label` says which are nominal.
+    """
+
+    def __init__(self, recipe: Recipe) -> None:
+        self._recipe = recipe
+        self._counts: dict[str, Counter[float | str]] = {}
+        self._lacking: set[str] = set()
+
+    def add(self, text: str, cells: Column) -> None:
+        """Count the cells of a column, by its text in the recipe."""
+        values, counts = np.unique(cells[cells == cells], return_counts=True)  # noqa: PLR0124
+        pairs = zip(values.tolist()[:_KEPT], counts.tolist(), strict=False)
+        self._counts.setdefault(text, Counter()).update(dict(pairs))
+
+    def merge(self, other: Self) -> None:
+        """Add the cells of another recording, and the columns that it lacks."""
+        for text, counts in other._counts.items():
+            self._counts.setdefault(text, Counter()).update(counts)
+        self._lacking |= {*self._recipe.label_columns} - {*other._counts}
+
+    def is_signed(self, text: str) -> bool:
+        """Tell whether -1 is a label, and nothing says of what rows."""
+        return not self._recipe.nominal_label and bool({-1.0, "-1"} & {*self._counts.get(text, ())})
+
+    def problems(self) -> Iterator[tuple[str, str]]:
+        """Yield the columns that do not say which rows are nominal, each with what to do."""
+        nominal = self._recipe.nominal_label
+        for text, counts in self._counts.items():
+            labels = Counter({v: n for v, n in counts.items() if str(v).strip()})
+            said = [not anomalous_cells(np.array([v]), self._recipe, before=False) for v in counts]
+            why = ""
+            if not any(said) and text not in self._lacking:
+                accepted = f"nominal_label, {[*nominal]}" if nominal else "0, false, H or nothing"
+                why = f"none of them is nominal: {accepted}"
+            elif self.is_signed(text):
+                why = "-1 is the label of nominal rows in some logs, of anomalous ones in others"
+            elif not nominal and says_nominal(text):
+                why = "by its name 1 is nominal, and without nominal_label 0 is"
+            if why:
+                rows = ", ".join(f"{plain_label(v)!r} ({n} rows)" for v, n in labels.most_common(6))
+                likely, reason = likely_nominal(text, labels)
+                key = f"nominal_label = {json.dumps([*map(plain_label, likely)])}"
+                advice = f"{key}, if that is nominal{reason}" if likely else "nominal_label = [...]"
+                yield text, f"labels {text!r} are {rows}, and {why}: write {advice}"
+
+
+def likely_nominal(
+    name: str, values: Mapping[float | str, int]
+) -> tuple[tuple[float | str, ...], str]:
+    """Return the labels that are nominal as far as one can tell, and why in words.
+
+    Parameters
+    ----------
+    name
+        Of the column.
+    values
+        Number of rows by label.
+
+    Returns
+    -------
+    tuple
+        Labels, and ``, as in most rows`` where nothing else speaks for them; both are empty where
+        no label is.
+
+    Examples
+    --------
+    >>> likely_nominal("fault", {0.0: 7, 1.0: 9}), likely_nominal("y", {1.0: 90, -1.0: 9})
+    (((0.0,), ''), ((1.0,), ', as in most rows'))
+    """
+    true = says_nominal(name)
+    words = [v for v in values if (str(v).lower() in _TRUE if true else _is_nominal_word(v))]
+    if words and len(words) < len(values):
+        return tuple(words), ""
+    if 0.0 in values and -1.0 not in values:
+        return (0.0,), ""
+    most = max(values, key=lambda value: values[value], default=0.0)
+    if values and values[most] >= _CLEAR * sum(values.values()):
+        return (most,), ", as in most rows"
+    return (), ""
+
+
+def says_nominal(name: str) -> bool:
+    """Tell whether the name of a label says that it is true of nominal rows."""
+    plain = split_unit(name)[0].rpartition(".")[2].lower()
+    return bool(re.fullmatch(r"(?:is[_ ]?)?(?:healthy|normal|nominal|ok|good|inlier)", plain))
+
+
+def _is_nominal_word(value: float | str) -> bool:
+    text = value if isinstance(value, str) else ""
+    return text.strip().lower() in _SHORT or bool(NOMINAL_WORDS.search(text))
+
+
+def plain_label(value: float | str) -> int | float | str:
+    """Return a label as a recipe has it, whole numbers without a point."""
+    return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 def runs_of(anomalous: NDArray[np.bool_]) -> list[tuple[int, int]]:

@@ -12,7 +12,7 @@ from oodd_eval.data.parts import CALIBRATION, TRAIN, TWINS
 from oodd_eval.errors import TrajectoryError, UnknownNameError, UsageError
 from oodd_logs.kinds.times import orders_of, parse_times
 from oodd_logs.ledger import Fate, Item, Ledger
-from oodd_logs.marks import IntervalList, Mark, anomalous_cells, runs_of
+from oodd_logs.marks import IntervalList, LabelValues, Mark, anomalous_cells, runs_of
 from oodd_logs.readers.cells import mixed
 from oodd_logs.recipe import Recipe, anomaly_name
 from oodd_logs.recording import Column, Recording
@@ -140,6 +140,8 @@ class StampedRows:
     ----------
     topics
         Rows of the topics with chosen columns.
+    labels
+        Cells of label columns, once `marks` has read them.
 
     Raises
     ------
@@ -152,6 +154,7 @@ class StampedRows:
     ) -> None:
         self._recorded, self._selection = recorded, selection
         self._recipe, self._ledger = recipe, ledger
+        self.labels = LabelValues(recipe)
         self.topics = {
             name: TopicRows(recorded.recording, name, selection, recipe, ledger, recorded.label)
             for name in selection.topics
@@ -310,6 +313,9 @@ class StampedRows:
                 labels = self._labels(cells, start, column.column)
                 before = bool(blocks[-1][-1:].any())
                 blocks.append(anomalous_cells(labels, recipe, before=before))
+                self.labels.add(text, labels)
+            if recipe.missing == "keep" and self.labels.is_signed(text):
+                continue  # a scan says so, and judges by no label
             marks += [
                 Mark(begin, end, kind)
                 for start, stop in runs_of(np.concatenate(blocks))

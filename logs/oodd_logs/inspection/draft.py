@@ -6,14 +6,13 @@ import re
 import textwrap
 import tomllib
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS
 from oodd_eval.names import listed
 from oodd_logs.inspection.logs import Inspection, inspect_logs
 from oodd_logs.inspection.meaning import (
-    NOMINAL_WORDS,
     cuts_of,
     fields_of,
     gap_of,
@@ -21,7 +20,6 @@ from oodd_logs.inspection.meaning import (
     lacks_rows,
     lacks_values,
     name_of,
-    nominal_values,
     rate_of,
     sort_files,
     window_of,
@@ -29,6 +27,7 @@ from oodd_logs.inspection.meaning import (
 from oodd_logs.inspection.report import number, time_lines
 from oodd_logs.inspection.roles import line_of, role_of, toml
 from oodd_logs.kinds import kinds
+from oodd_logs.marks import NOMINAL_WORDS, likely_nominal, plain_label
 from oodd_logs.readers import NO_OPTIONS, Options
 from oodd_logs.recipe import MISSING_ROWS, Recipe
 
@@ -170,9 +169,13 @@ def _draft_labels(logs: Inspection) -> Iterator[str]:
         label, *alternatives = logs.labels
         also = f"  # or {listed(alternatives)}" if alternatives else ""
         yield f"labels = {toml(label)}{also}"
-        values = nominal_values(logs, label)
-        if values not in {(0.0,), ("H",)}:
-            yield f"nominal_label = {toml(values)}"
+        counts: Mapping[float | str, int] = logs.columns[label].values or {}
+        values, reason = likely_nominal(label, counts)
+        plain = toml([*map(plain_label, values or [*counts][:1])])
+        if not values:
+            yield f"# nominal_label = {plain}  # say which of the labels is that of nominal rows"
+        elif values not in {(0.0,), ("H",)}:
+            yield f"nominal_label = {plain}{reason and f'  #{reason[1:]}: check it'}"
     elif key := next((key for key in ("outcome", "kinds") if key in keys), ""):
         yield f"{key} = {toml(keys[key])}"
     else:

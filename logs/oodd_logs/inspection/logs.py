@@ -29,6 +29,7 @@ from oodd_logs.inspection.roles import Recognised, recognise, role_of
 from oodd_logs.kinds import kinds
 from oodd_logs.kinds.times import UNIT_NAMES, names_time, pairs_of, unit_in, unit_of
 from oodd_logs.ledger import Ledger
+from oodd_logs.marks import says_nominal
 from oodd_logs.readers import NO_OPTIONS, Options, Reader, in_order, readers
 from oodd_logs.recording import Column, Recording, Topic
 from oodd_logs.selecting import plain_name, split_unit
@@ -47,7 +48,8 @@ _ENDS: Final = 2000  # rows at either end of a recording that are compared with 
 _OVERLAP: Final = 20  # rows that two recordings have to share
 _PRIME: Final = np.uint64(0x100000001B3)
 _LABEL: Final = re.compile(
-    r"anomal|fault|fail|label|health|attack|alarm|error|class|status|stop|lost|binary",
+    r"anomal|fault|fail|label|health|attack|alarm|error|class|status|stop|lost|binary"
+    r"|outlier|novelty|defect",
     re.IGNORECASE,
 )
 _DAY: Final = 86400  # seconds
@@ -238,9 +240,11 @@ class Inspection:
             values: Mapping[float | str, int] = facts.values or {}
             numbers = [value for value in values if not isinstance(value, str)]
             partial = facts.recordings < len(self.recordings) and 0.0 in values
-            often = partial or values.get(0.0, 0) > facts.cells / 4
+            is_good = says_nominal(name)
+            often = partial or values.get(float(is_good), 0) > facts.cells / 4
+            often = often or {*values} in ({-1.0, 1.0}, {-1.0, 0.0, 1.0})
             fits = bool(facts.words) or (often and all(x == round(x) for x in numbers))
-            says_so = _LABEL.search(name.removeprefix(self.topic_of(name)))
+            says_so = is_good or _LABEL.search(name.removeprefix(self.topic_of(name)))
             if facts.flag and fits and (partial or says_so):
                 candidates.append((len(values) > 2, facts.missing > 0, not facts.text, name))
         return tuple(name for *_, name in sorted(candidates, key=lambda row: row[:-1]))

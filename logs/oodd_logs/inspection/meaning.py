@@ -16,13 +16,9 @@ from oodd_eval.data.facts import ANOMALIES
 from oodd_logs.inspection.columns import ColumnFacts
 from oodd_logs.inspection.logs import SLOW, Inspection, RecordingFacts
 from oodd_logs.kinds.times import SCALES
+from oodd_logs.marks import NOMINAL_WORDS, likely_nominal
 from oodd_logs.stamps import GAP_STEPS
 
-NOMINAL_WORDS: Final = re.compile(
-    r"(?:^|[^a-z])(?:nominal|normal|healthy|good|free|baseline|reference|no[^a-z]?(?:fault|failure|anomal\w*))"
-    r"(?:$|[^a-z])",
-    re.IGNORECASE,
-)
 _TASK: Final = re.compile(r"(?:^|_)(?:task|setpoint|set_point)(?:_id|_index)?$", re.IGNORECASE)
 _WINDOWS: Final = 100  # episodes that long recordings are cut to, roughly
 _SHORTEST: Final = 50  # rows of a window
@@ -61,12 +57,10 @@ def keys_of_fields(logs: Inspection) -> dict[str, str]:
 
 
 def nominal_values(logs: Inspection, label: str) -> tuple[float | str, ...]:
-    """Return the values of a label that are nominal."""
+    """Return the values of a label that are nominal, those of most rows where none says so."""
     values: Mapping[float | str, int] = logs.columns[label].values or {}
-    if not logs.columns[label].text and 0.0 in values:
-        return (0.0,)
-    words = [v for v in values if v in {"H", "0", 0.0} or NOMINAL_WORDS.search(str(v))]
-    return tuple(words) or (max(values, key=lambda v: values[v]),)
+    likely, _ = likely_nominal(label, values)
+    return likely or (max(values, key=lambda value: values[value]),)
 
 
 def anomalous_rows(recording: RecordingFacts, label: str, nominal: Sequence[float | str]) -> int:
