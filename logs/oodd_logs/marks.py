@@ -132,11 +132,13 @@ class LabelValues:
             labels = Counter({v: n for v, n in counts.items() if str(v).strip()})
             said = [not anomalous_cells(np.array([v]), self._recipe, before=False) for v in counts]
             why = ""
-            if not any(said) and text not in self._lacking:
-                accepted = f"nominal_label, {[*nominal]}" if nominal else "0, false, H or nothing"
-                why = f"none of them is nominal: {accepted}"
-            elif self.is_signed(text):
+            if self.is_signed(text):
                 why = "-1 is the label of nominal rows in some logs, of anomalous ones in others"
+            elif not any(said) and text not in self._lacking:
+                accepted = (
+                    f"nominal_label is {[*nominal]}" if nominal else "0, false, H, or nothing"
+                )
+                why = f"none of them is nominal ({accepted})"
             elif not nominal and says_nominal(text):
                 why = "by its name 1 is nominal, and without nominal_label 0 is"
             if why:

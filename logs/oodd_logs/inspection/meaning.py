@@ -24,7 +24,7 @@ _WINDOWS: Final = 100  # episodes that long recordings are cut to, roughly
 _SHORTEST: Final = 50  # rows of a window
 ENOUGH: Final = 38
 """Nominal episodes of which a third is enough for a threshold."""
-_LAYOUTS: Final = {"onset", "seed", "terminated", "parameters", "discrete", "start"}
+_LAYOUTS: Final = {"onset", "seed", "terminated", "truncated", "parameters", "discrete", "start"}
 
 
 @dataclass(frozen=True, slots=True)

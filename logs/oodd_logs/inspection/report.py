@@ -30,6 +30,7 @@ from oodd_logs.inspection.meaning import (
 from oodd_logs.inspection.roles import ROLES, line_of, role_of, toml
 from oodd_logs.kinds import kinds
 from oodd_logs.kinds.times import SCALES, UNIT_NAMES
+from oodd_logs.marks import likely_nominal, plain_label
 from oodd_logs.readers import quantity
 from oodd_logs.recipe import MISSING_ROWS
 from oodd_logs.stamps import GAP_STEPS
@@ -72,7 +73,7 @@ _TEXTS: Final = {
     "float32 would lose: the import subtracts training's mean in float64",
     "intervals": '{file} names rows of files: write intervals = "{file}"',
     "labels": "{label} may say what is anomalous: {anomalous} of {rows} rows, in {some} of "
-    '{episodes}: write labels = "{label}"{also}',
+    '{episodes}: write labels = "{label}"{nominal}{also}',
     "fields": "{name} of each episode: {values}{key}",
     "nominal": "nothing says what is anomalous: all counts as nominal until a recipe names files "
     "below [anomalous.NAME]",
@@ -191,6 +192,8 @@ def _of_labels(logs: Inspection) -> Iterator[Advice]:
         yield _say("intervals", file=logs.intervals)
     if labels := logs.labels:
         values = nominal_values(logs, labels[0])
+        _, reason = likely_nominal(labels[0], logs.columns[labels[0]].values or {})
+        plain = [*map(plain_label, values)]
         anomalous = [anomalous_rows(r, labels[0], values) for r in logs.recordings]
         yield _say(
             "labels",
@@ -199,6 +202,7 @@ def _of_labels(logs: Inspection) -> Iterator[Advice]:
             rows=sum(sum(r.values.get(labels[0], {}).values()) for r in logs.recordings),
             some=sum(map(bool, anomalous)),
             episodes=counted(len(logs.recordings), "episode(s)"),
+            nominal="" if values == (0.0,) else f", nominal_label = {toml(plain)}{reason}",
             also=f"; perhaps {listed(labels[1:])}" if len(labels) > 1 else "",
         )
     keys = keys_of_fields(logs)

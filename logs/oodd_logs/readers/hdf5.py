@@ -19,7 +19,7 @@ from oodd_logs.recording import Recording
 
 _DEEPEST: Final = 6  # levels of groups
 _LONGEST: Final = 1000  # characters of a text among the fields; simulators keep their model there
-_LEFT_OUT: Final = ("next_obs", "next_observations", "infos", "truncations")
+_LEFT_OUT: Final = ("next_obs", "next_observations", "infos")
 
 
 def read_groups(
@@ -52,8 +52,11 @@ def read_groups(
         fields = _fields(file, group, source)
         skipped: dict[str, str] = {}
         arrays: dict[str, MatrixRows] = dict(_arrays(file, group, "", 0, skipped))
-        if "terminations" in arrays:
-            fields["terminated"] = bool(np.any(arrays.pop("terminations")[:]))
+        for flag in ("terminations", "truncations"):
+            # Above the last row it ends one of several episodes, which a recipe may tell apart.
+            if flag in arrays and not np.any(arrays[flag][:-1]):
+                name = "terminated" if flag == "terminations" else "truncated"
+                fields[name] = bool(np.any(arrays.pop(flag)[-1:]))
         if transposed:
             arrays = {k: _Transposed(a) if len(a.shape) == 2 else a for k, a in arrays.items()}
         topic, single, ledger = episode_of(arrays, source, sensors, actions)

@@ -166,8 +166,8 @@ def _arrays(lists: Mapping[str, Any], source: str, fields: Mapping[str, Any]) ->
     arrays = {key: np.asarray(v) for key, v in lists.items()}
     if any(array.dtype.kind not in "fiub" for array in arrays.values()):
         return None
-    topic, single = episode_of(cast("Mapping[str, MatrixRows]", arrays), source)
-    return Recording("", source, {"": topic}, {**single, **fields})
+    topic, single, ledger = episode_of(cast("Mapping[str, MatrixRows]", arrays), source)
+    return Recording("", source, {"": topic}, {**single, **fields}, ledger)
 
 
 def _recording(
