@@ -34,6 +34,7 @@ __all__ = [
     "evaluate",
     "hookimpl",
     "import_frames",
+    "live",
     "load_results",
     "load_split",
 ]
@@ -51,12 +52,14 @@ _NAMES = {
 _HOMES = {name: f"{__name__}.{home}" for home, names in _NAMES.items() for name in names}
 # Known by name alone: nothing here imports these packages.
 _HOMES |= {"check_detector": "oodd_checks", "import_frames": "oodd_logs"}
+_MODULES = {"live": "oodd_live"}
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
+    if name not in _HOMES | _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(import_module(_HOMES[name]), name)
+    value: Any = import_module(_HOMES.get(name) or _MODULES[name])
+    value = getattr(value, name) if name in _HOMES else value
     globals()[name] = value
     return value
 
