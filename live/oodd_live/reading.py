@@ -20,7 +20,7 @@ FEWEST: Final = 20
 """Nominal episodes that a tail can be estimated from."""
 TAIL: Final = 0.25
 """Share of the episodes, those with the largest statistics, that the tail is estimated from."""
-OK, WARN, ERROR, STALE = (bytes([level]) for level in range(4))
+OK, WARN, ERROR, STALE = range(4)
 """Levels of ROS 2's DiagnosticStatus."""
 _NORMAL: Final = 1.96  # a 95 % interval of a normal distribution
 
@@ -159,9 +159,10 @@ class Reading:
         Returns
         -------
         dict
-            Fields of the message by name. The level is a byte, as ROS has it: ERROR in an alarm,
-            STALE where no observation comes, WARN for a fault or a statistic above the threshold
-            without an alarm, else OK.
+            Fields of the message by name, for JSON as they are. The level is a number, of which
+            rclpy takes ``bytes([level])``: ERROR in an alarm, STALE where no observation comes,
+            WARN for a fault or a statistic above the threshold without an alarm, else OK. The score
+            and the statistic are empty where they are undefined.
         """
         seconds, nanoseconds = divmod(as_nanoseconds(time or 0.0), 10**9)
         level = OK
@@ -173,9 +174,7 @@ class Reading:
             level = STALE
         values = {
             "row": str(self.t),
-            "score": repr(float(self.score)),
-            "statistic": repr(float(self.statistic)),
-            "threshold": repr(float(self.threshold)),
+            **{n: _text(getattr(self, n)) for n in ("score", "statistic", "threshold")},
             "alarm": str(self.alarm).lower(),
             "onset": "" if self.onset is None else str(self.onset),
         }
@@ -237,6 +236,10 @@ def _causes(alarm: Reading | EpisodeAlarm) -> list[str]:
     if sensor and sensor not in alarm.faults:
         parts.append(f"{sensor} {alarm.sensors[sensor]:.0%}")
     return parts if alarm.onset is None else [*parts, f"since row {alarm.onset}"]
+
+
+def _text(number: float) -> str:
+    return repr(float(number)) if math.isfinite(number) else ""
 
 
 def as_nanoseconds(time: float) -> int:

@@ -1,9 +1,11 @@
 """Readings for ROS 2: field by field what diagnostic_msgs defines."""
 
+import json
 import math
 from dataclasses import replace
 
 import numpy as np
+import oodd_live
 import pytest
 from oodd_live import Reading
 from rosbags.typesys import Stores, get_typestore
@@ -19,7 +21,7 @@ def test_exact_shape():
         "header": {"stamp": {"sec": 12, "nanosec": 750_000_000}, "frame_id": ""},
         "status": [
             {
-                "level": b"\x02",
+                "level": 2,
                 "name": "arm watchdog",
                 "message": "row 7: alarm, gyro x frozen, since row 4",
                 "hardware_id": "arm-1",
@@ -54,7 +56,17 @@ def test_exact_shape():
 def test_levels_are_those_of_ros(changes, level):
     (status,) = replace(QUIET, **changes).diagnostics()["status"]
     constant = getattr(TYPES["diagnostic_msgs/msg/DiagnosticStatus"], level)
-    assert status["level"] == bytes([constant])
+    assert status["level"] == constant
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf, np.float32(0.1)])
+def test_json_takes_them_as_they_are(number):
+    reading = replace(QUIET, score=number, statistic=number, alarm=True)
+    array = reading.diagnostics(time=np.float64(1.5))
+    assert json.loads(json.dumps(array, allow_nan=False)) == array
+    values = {v["key"]: v["value"] for v in array["status"][0]["values"]}
+    finite = repr(float(number)) if math.isfinite(number) else ""
+    assert (values["score"], values["statistic"]) == (finite, finite)
 
 
 def test_serialized_as_ros_does():
@@ -64,7 +76,7 @@ def test_serialized_as_ros_does():
     header = TYPES["std_msgs/msg/Header"](**array["header"] | {"stamp": stamp})
     (status,) = array["status"]
     values = [TYPES["diagnostic_msgs/msg/KeyValue"](**v) for v in status["values"]]
-    told = status | {"level": status["level"][0], "values": values}
+    told = status | {"values": values}
     content = TYPES["diagnostic_msgs/msg/DiagnosticArray"](
         header=header, status=[TYPES["diagnostic_msgs/msg/DiagnosticStatus"](**told)]
     )
@@ -76,3 +88,9 @@ def test_serialized_as_ros_does():
     assert [(v.key, v.value) for v in back.status[0].values][:2] == [("row", "7"), ("score", "0.5")]
     assert QUIET.diagnostics()["header"]["stamp"] == {"sec": 0, "nanosec": 0}
     assert QUIET.diagnostics()["status"][0]["name"] == "oodd"
+
+
+def test_the_evaluator_knows_the_package_by_name():
+    from oodd_eval import live
+
+    assert live is oodd_live
