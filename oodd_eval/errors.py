@@ -107,6 +107,10 @@ class PromiseWarning(UserWarning):
     """Something puts a promise on false alarms in doubt."""
 
 
+class PrecisionWarning(UserWarning):
+    """Readings lose what they tell when they are rounded to float32."""
+
+
 class MissingExtraError(OoddError, ImportError):
     """An optional dependency that the requested work needs."""
 

@@ -7,6 +7,7 @@ from typing import Any, Self, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from oodd_eval.arrays import as_numbers
 from oodd_eval.data.baseline import Baseline, check_baseline, episode_means
 from oodd_eval.data.facts import roles_of
 from oodd_eval.data.offsets import fit_offsets
@@ -180,13 +181,13 @@ def _raw(episode: Episode) -> Trajectory | tuple[Floats, ArrayLike | None]:
     if isinstance(episode, tuple) and len(episode) == 2 and np.ndim(episode[0]) == 2:
         observations, actions = episode
     try:
-        array = np.asarray(observations, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+        array = as_numbers(observations)
+    except TrajectoryError as error:
         raise TrajectoryError(f"an episode cannot be read as numbers: {error}") from None
     if array.ndim != 2 or 0 in array.shape or not np.isfinite(array).all():
         raise TrajectoryError(
             f"an episode has observations of shape {array.shape}, expected a Trajectory, finite "
-            "numbers (rows, sensors), or a tuple of these and of actions"
+            "numbers (rows, sensors), none missing or masked, or a tuple of these and of actions"
         )
     return array, actions
 
@@ -212,4 +213,5 @@ def _trajectory(
             f"an episode has {observations.shape[1]} sensors, expected {len(offsets)} as in the "
             "first training episode"
         )
-    return Trajectory(observations - offsets, actions)
+    # Rounded here: what float32 cannot tell is subtracted.
+    return Trajectory((observations - offsets).astype(np.float32), actions)

@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from oodd_eval.arrays import as_numbers
 from oodd_eval.data.baseline import Baseline, Shift
 from oodd_eval.errors import TrajectoryError
 from oodd_eval.metrics.faults import FAR, KINDS, ROWS, ParetoTail, StreamScale, counted, repeated
@@ -221,11 +222,11 @@ class Stream:
         self._quiet = self._quiet and not count
 
     def _read(self, source: str, values: ArrayLike | None, width: int) -> NDArray[np.float32]:
-        """Return values as float32, NaN for what is missing."""
+        """Return values as float32, NaN for what is missing or masked."""
         if values is None:
             return np.full(width, np.nan, np.float32)
         with np.errstate(over="ignore", invalid="ignore"):
-            row = np.asarray(values, dtype=np.float64).astype(np.float32)
+            row = as_numbers(values).astype(np.float32)
         if row.shape != (width,):
             raise TrajectoryError(
                 f"the watchdog got an {source} of shape {row.shape}, expected ({width},) as "

@@ -11,6 +11,7 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from oodd_eval.arrays import as_numbers
 from oodd_eval.data.parts import EnvironmentData
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import (
@@ -334,7 +335,7 @@ class Watchdog:
         observation : array of shape (D,), mapping or None
             The newest readings as the sensors send them, or readings by sensor. Offsets of the
             split are subtracted; `replay` takes its episodes, of which they are already. NaN,
-            infinite or absent: no reading came from that sensor in time; None: from none.
+            infinite, masked or absent: no reading came from that sensor in time; None: from none.
         action : array of shape (A,), optional
             Commanded since the row before; None at the first row.
         time, acted
@@ -348,7 +349,7 @@ class Watchdog:
         Raises
         ------
         TrajectoryError
-            For an array of another length, which is a mistake of the caller and no fault.
+            For an array of another length, or without numbers: a mistake of the caller, no fault.
         UsageError
             For a time stamp without a rate, or one of an action alone, and for a reading of a
             sensor that is none of `sensors`.
@@ -480,7 +481,7 @@ class Watchdog:
         """Return readings without offsets, in float64; of another length as they are."""
         if observation is None or not self._nominal.offsets.any():
             return observation
-        row = np.asarray(observation, dtype=np.float64)
+        row = as_numbers(observation)
         return row - self._nominal.offsets if row.shape == self._nominal.offsets.shape else row
 
     def _blamed(self) -> tuple[dict[str, float], int | None]:

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from oodd_eval.data.arrays import as_array, as_numbers, in_memory, is_missing
+from oodd_eval.arrays import as_array, as_numbers, in_memory, is_missing
 from oodd_eval.errors import TrajectoryError
 from oodd_logs.episodes import EpisodeSource, make_every_episode
 from oodd_logs.readers import library

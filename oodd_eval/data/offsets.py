@@ -15,6 +15,9 @@ Floats = NDArray[np.float64]
 STEPS: Final = 1 << 14
 """Steps of float32, at a sensor's largest value, below which its spread is not told well enough."""
 
+_LOST: Final = 1 << 8  # steps below which rounding, by half of one, takes what changes tell
+_STILL: Final = 2.0**-33  # share of the largest value that solvers and their like move by
+
 
 @dataclass(slots=True)
 class RunningMoments:
@@ -76,6 +79,25 @@ def is_coarse(spread: Any, largest: Any) -> Any:
     with np.errstate(over="ignore", invalid="ignore"):
         steps = np.spacing(np.float32(largest)).astype(np.float64)
     return (spread > 0) & (spread < STEPS * steps)
+
+
+def coarse_sensors(observations: Floats) -> str:
+    """Return in a sentence which sensors of an episode lose their changes in float32, if any do.
+
+    >>> print(coarse_sensors(5_412_345.0 + 0.02 * np.eye(2, 1)).partition(":")[0])
+    float32 rounds sensor 0, 5.41235e+06 with a spread of 0.01, to steps of 0.5
+    """
+    with np.errstate(all="ignore"):  # what is not finite is refused elsewhere
+        spread, largest = observations.std(axis=0), np.abs(observations).max(axis=0)
+        rounded, steps = observations.astype(np.float32), np.spacing(np.float32(largest))
+    coarse = (spread < _LOST * steps) & (spread > _STILL * largest)
+    for d in np.flatnonzero(coarse & (rounded != observations).any(axis=0))[:1]:
+        return (
+            f"float32 rounds sensor {d}, {largest[d]:g} with a spread of {spread[d]:.1g}, to steps "
+            f"of {steps[d]:.1g}: hand arrays of float64 over to Watchdog.fit and scan_episodes, "
+            "which subtract a mean before, or subtract one yourself"
+        )
+    return ""
 
 
 def fit_offsets(train: Sequence[Floats]) -> tuple[float, ...]:

@@ -4,6 +4,7 @@ Time runs as in the protocol: observations ``o_0 .. o_T`` (T + 1 rows) and the c
 ``a_0 .. a_{T-1}`` between them; ``a_t`` was chosen after ``o_t`` was seen.
 """
 
+import warnings
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from typing import overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from oodd_eval.errors import TrajectoryError
+from oodd_eval.errors import PrecisionWarning, TrajectoryError
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,7 +31,12 @@ class Trajectory:
     Raises
     ------
     TrajectoryError
-        When a shape does not fit, an array is empty or a value is not finite.
+        When a shape does not fit, an array is empty or a value is not finite, missing or masked.
+
+    Warns
+    -----
+    PrecisionWarning
+        When float32 has too few steps for the spread of a sensor whose readings come with more.
 
     Examples
     --------
@@ -48,7 +54,9 @@ class Trajectory:
 
     def __init__(self, observations: ArrayLike, actions: ArrayLike | None = None) -> None:
         o = _matrix("observations", observations)
-        a = _matrix("actions", np.empty((len(o) - 1, 0)) if actions is None else actions)
+        a = _matrix(
+            "actions", np.empty((len(o) - 1, 0), np.float32) if actions is None else actions
+        )
         if len(o) != len(a) + 1:
             raise TrajectoryError(
                 f"a trajectory has one observation more than actions: got {len(o)} observations "
@@ -118,21 +126,35 @@ class TrajectorySequence(Sequence[Trajectory]):
 
 
 def _matrix(name: str, values: ArrayLike) -> NDArray[np.float32]:
-    try:
+    if type(values) is not np.ndarray or values.dtype != np.float32:
+        values = _numbers(name, values)
+    with np.errstate(over="ignore"):  # it is not finite, see below
         array = np.array(values, dtype=np.float32, order="C", ndmin=1)
-    except (TypeError, ValueError) as error:
-        raise TrajectoryError(f"{name} cannot be read as a float32 matrix: {error}") from None
     if array.ndim != 2 or (name == "observations" and 0 in array.shape):
-        raise TrajectoryError(
-            f"{name} have shape {array.shape}, expected (rows, columns)"
-            + (" with at least one row and one column" if name == "observations" else "")
-        )
+        some = " with at least one row and one column" if name == "observations" else ""
+        raise TrajectoryError(f"{name} have shape {array.shape}, expected (rows, columns){some}")
     bad = ~np.isfinite(array)
     if bad.any():
         row, column = (int(i) for i in np.argwhere(bad)[0])
         raise TrajectoryError(
-            f"{name} hold {int(bad.sum())} values that are not finite, the first at row {row}, "
-            f"column {column}: {array[row, column]}; a trajectory has finite values only"
+            f"{name} hold {int(bad.sum())} values that are not finite, missing or masked, the "
+            f"first at row {row}, column {column}: {array[row, column]}; a trajectory has finite "
+            "values only"
         )
     array.flags.writeable = False
     return array
+
+
+def _numbers(name: str, values: ArrayLike) -> NDArray[np.float64]:
+    """Return numbers in float64; warn where float32 loses what they tell."""
+    from oodd_eval.arrays import as_numbers  # noqa: PLC0415  splits have float32
+    from oodd_eval.data.offsets import coarse_sensors  # noqa: PLC0415  as above
+
+    try:
+        numbers = as_numbers(values)
+    except TrajectoryError as error:
+        raise TrajectoryError(f"{name} cannot be read as a float32 matrix: {error}") from None
+    is_matrix = name == "observations" and numbers.ndim == 2 and len(numbers)
+    if is_matrix and (text := coarse_sensors(numbers)):
+        warnings.warn(text, PrecisionWarning, stacklevel=4)
+    return numbers

@@ -1,6 +1,7 @@
 """`Trajectory`: what a detector is handed."""
 
 import os
+import warnings
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from oodd_eval.data.trajectory import Trajectory
-from oodd_eval.errors import TrajectoryError
+from oodd_eval.errors import PrecisionWarning, TrajectoryError
 from oodd_eval.plugins.isolation import Channel
 from oodd_eval.plugins.isolation.worker import TrajectoryFile
 
@@ -84,8 +85,42 @@ def test_only_non_empty_prefixes_are_trajectories(rows):
         ([[1.0, 2.0], [3.0]], [[0.0]], "cannot be read as a float32 matrix"),
         ([[0.0], [np.nan], [0.0]], np.zeros((2, 1)), "row 1, column 0: nan"),
         (np.zeros((3, 2)), [[0.0], [np.inf]], "actions hold 1 values that are not finite"),
+        (np.ma.masked_equal([[0.0], [9.0], [0.0]], 9), None, "masked.*row 1, column 0: nan"),
+        (np.ma.masked_equal([[0], [9], [0]], 9), None, "row 1, column 0: nan"),
+        ([*np.ma.masked_equal([[0.0], [9.0], [0.0]], 9)], None, "row 1, column 0: nan"),
+        (np.zeros((2, 2)), np.ma.masked_equal([[9.0]], 9), "actions hold 1.*masked"),
+        ([[0.0], [None], [0.0]], None, "row 1, column 0: nan"),
+        (np.full((2, 1), 1e300), None, "inf"),
+        (np.zeros((3, 2), complex), None, "complex"),
+        (np.zeros((3, 2), "M8[s]"), None, "dates"),
+        (np.array([[1.0], ["x"]], object), None, "'x'"),
+        (np.zeros(3, [("a", "f8")]), None, "named fields"),
+        ({1.0}, None, "set"),
     ],
 )
 def test_bad_arrays_are_named(observations, actions, message):
     with pytest.raises(TrajectoryError, match=message):
         Trajectory(observations, actions)
+
+
+@pytest.mark.parametrize(
+    ("offset", "spread", "told"),
+    [
+        (5_412_345.0, 0.02, True),  # a northing
+        (1.76e9, 1.0, True),  # an epoch
+        (1e8, 30, True),  # an encoder
+        (9.81, 0.01, False),
+        (0.0, 1e-9, False),
+        (1.0, 1e-12, False),  # a solver's rounding
+    ],
+)
+def test_readings_that_float32_cannot_tell_are_told(offset, spread, told):
+    rows = offset + np.random.default_rng(0).normal(0, spread, (50, 2)) * [0, 1]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        episode = Trajectory(rows)
+        Trajectory(rows.astype(np.float32))[:20].without_actions()
+    assert [w.category for w in caught] == [PrecisionWarning] * told
+    assert all("float32 rounds sensor 1," in str(w.message) for w in caught)
+    assert all(w.filename == __file__ for w in caught)
+    assert np.array_equal(episode.observations, rows.astype(np.float32))

@@ -9,7 +9,7 @@ from oodd_live import Watchdog
 from oodd_live.stream import Stream
 
 from oodd_eval import Trajectory, load_split
-from oodd_eval.errors import UsageError
+from oodd_eval.errors import TrajectoryError, UsageError
 from oodd_eval.metrics.faults import ParetoTail, StreamLimits, StreamScale
 
 pytestmark = pytest.mark.slow
@@ -17,6 +17,7 @@ pytestmark = pytest.mark.slow
 TRAIN = [walk(seed, contact=True) for seed in range(20)]
 
 
+NORTHING = 5_412_345.0
 CALIBRATION = [walk(seed, contact=True) for seed in range(50, 80)]
 USUAL = ParetoTail(0.0, 1.0, 0.0, 1.0)
 """Of a statistic that is as large as it is surprising."""
@@ -164,6 +165,54 @@ def test_readings_come_by_name_too():
     assert not watchdog.update({"x": 0.07, "contact": 0.0}, [0.0]).alarm
     readings = [watchdog.update({"contact": 0.0, "x": np.nan}, [0.0]) for _ in range(4)]
     assert readings[-1].alarm
+
+
+MISSING = {
+    "masked": np.ma.masked_array([0.1, 9999.0, 1.0], [0, 1, 0]),
+    "masked whole numbers": np.ma.masked_array([0, 9999, 1], [0, 1, 0]),
+    "masked in a list": [0.1, np.ma.masked, 1.0],
+    "None": [0.1, None, 1.0],
+    "None by name": {"x": 0.1, "y": None, "contact": 1.0},
+    "masked by name": {"x": 0.1, "y": np.ma.masked, "contact": 1.0},
+}
+
+
+@pytest.mark.parametrize("offset", [0.0, NORTHING])
+@pytest.mark.parametrize("form", MISSING)
+def test_what_is_missing_in_any_form_is_no_reading(offset, form):
+    episodes = [x.observations + np.array([0.0, offset, 0.0]) for x in TRAIN]
+    names = ["x", "y", "contact"]
+    watchdog = Watchdog.fit("mahalanobis", episodes, episodes, 0.1, sensors=names)
+    assert bool(watchdog._nominal.offsets.any()) == bool(offset)
+    expected = watchdog.update([0.1, np.nan, 1.0])
+    watchdog.reset()
+    assert watchdog.update(MISSING[form]) == expected
+    for _ in range(6):
+        faulty = watchdog.update(MISSING[form])
+    assert faulty.faults["y"] == "missing"
+
+
+@pytest.mark.parametrize(
+    ("episode", "word"),
+    [
+        (np.ma.masked_equal([[0.0, 9.0]] * 9, 9), "masked"),
+        ([*np.ma.masked_equal([[0.0, 9.0]] * 9, 9)], "masked"),
+        ((np.ma.masked_equal([[0.0, 9.0]] * 9, 9), np.zeros((8, 1))), "masked"),
+        ((np.zeros((9, 2)), np.ma.masked_equal([[0.0, 9.0]] * 8, 9)), "actions.*masked"),
+        (np.zeros((9, 2), complex), "complex"),
+        (np.array([["x"]]), "no real numbers"),
+    ],
+)
+def test_a_watchdog_is_fitted_on_what_was_read(episode, word):
+    with pytest.raises(TrajectoryError, match=word):
+        Watchdog.fit("mahalanobis", [episode] * 20, [episode] * 20)
+
+
+def test_a_reading_that_is_no_number_is_a_mistake_of_the_caller():
+    watchdog = Watchdog.fit("persistence", TRAIN, TRAIN, 0.1)
+    for row in (["a", "b", "c"], [0.0, 1j, 0.0], np.zeros(3, "M8[s]")):
+        with pytest.raises(TrajectoryError, match="real numbers"):
+            watchdog.update(row)
 
 
 @pytest.mark.parametrize(

@@ -257,7 +257,7 @@ def doubled_in_arrow():
         (lambda: {"a": [{"x": 1}]}, "column 'a'.*dict"),
         (lambda: [{"a": [1, 2]}, {"a": [3, 4]}], r"column 'a' has cells of shape \(2,\)"),
         (lambda: {"a": [1], "b": [1, 2]}, "lengths"),
-        (lambda: [[1, 2], [3]], "cannot be read as an array"),
+        (lambda: [[1, 2], [3]], "list is no array"),
         (lambda: {1.0, 2.0}, "set"),
         (lambda: None, r"shape \(\)"),
     ],

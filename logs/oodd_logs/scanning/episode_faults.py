@@ -64,7 +64,7 @@ def clean(episodes: Sequence[Episode]) -> list[CleanedEpisode]:
         rows = episode.observations - offset
         held = _held(rows, spread), _held(episode.actions, commanded)
         read = np.where(_is_good(rows, spread), rows, np.nan).astype(np.float32)
-        cleaned.append(CleanedEpisode(Trajectory(*held), read))
+        cleaned.append(CleanedEpisode(Trajectory(*(x.astype(np.float32) for x in held)), read))
     return cleaned
 
 

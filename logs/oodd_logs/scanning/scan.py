@@ -19,7 +19,7 @@ from oodd_live.handle import DetectorHandle, has_actions
 from oodd_live.nominal import sensor_names
 from oodd_live.watchdog import Watchdog
 
-from oodd_eval.data.arrays import as_numbers
+from oodd_eval.arrays import as_numbers
 from oodd_eval.data.baseline import Baseline
 from oodd_eval.data.bounded import without_nan
 from oodd_eval.data.facts import roles_of

@@ -7,39 +7,31 @@ from numpy.typing import NDArray
 
 from oodd_eval.errors import TrajectoryError
 
-_NO_VALUE: Final = {"NAType", "NaTType", "MaskedConstant"}  # pandas.NA, pandas.NaT, numpy.ma.masked
+_MISSING: Final = {"NoneType", "NAType", "NaTType", "MaskedConstant"}  # of pandas and numpy.ma, too
+_EMPTY: Final = {"M": "NaT", "m": "NaT", "O": None, "U": "", "S": b"", "T": ""}
 _NOT_REAL: Final = {"c": "complex numbers", "M": "dates", "m": "durations", "V": "named fields"}
-_EMPTY: Final[dict[str, Any]] = {
-    **dict.fromkeys("fc", np.nan),
-    **dict.fromkeys("OT"),
-    "M": np.datetime64("NaT"),
-    "m": np.timedelta64("NaT"),
-}
 
 
 def is_missing(cell: object) -> bool:
     """Tell whether a cell of a table stands for no value: None, NaN, or a library's own mark."""
     number = isinstance(cell, float | np.generic)
-    return cell is None or type(cell).__name__ in _NO_VALUE or bool(number and cell != cell)  # noqa: PLR0124  NaN is not itself
+    return type(cell).__name__ in _MISSING or bool(number and cell != cell)  # noqa: PLR0124  NaN
 
 
 def in_memory(values: Any) -> Any:
-    """Return a lazy frame or lazy array computed, a tensor off its graph and device."""
-    for method in ("collect", "compute"):
-        if callable(getattr(values, method, None)):
-            return getattr(values, method)()
-    return values.detach().cpu() if hasattr(values, "detach") else values
+    """Return what is lazy or on a device as it is in memory."""
+    for method in ("collect", "compute", "detach", "cpu"):
+        values = getattr(values, method)() if callable(getattr(values, method, None)) else values
+    return values
 
 
 def as_array(values: Any) -> NDArray[Any]:
-    """Return values as an array whose missing entries are NaN, NaT, or None among objects.
-
-    Fill values of masked arrays go nowhere.
+    """Return values as an array whose missing entries are NaN, NaT, empty, or None among objects.
 
     Parameters
     ----------
     values
-        An array, a list of rows, a column or a data frame.
+        An array, a list of rows, a column or a data frame. Of masked entries nothing goes on.
 
     Raises
     ------
@@ -47,24 +39,18 @@ def as_array(values: Any) -> NDArray[Any]:
         When they are of another kind, or of unequal lengths.
     """
     try:
-        if isinstance(values, list | tuple) and any(
-            isinstance(row, list | tuple) or hasattr(row, "filled") or hasattr(row, "detach")
-            for row in values
-        ):
+        is_list = isinstance(values, list | tuple)
+        if is_list and any(hasattr(r, "filled") or hasattr(r, "detach") for r in values):
             return np.stack([as_array(row) for row in values])
         array: Any = np.asanyarray(in_memory(values))
         if not hasattr(array, "filled") or array.dtype.kind == "V" or not array.mask.any():
             return np.asarray(array)
         # Filled by hand: numpy takes None for its own fill value.
-        data: NDArray[Any] = array.data.astype(
-            np.float64 if array.dtype.kind in "iub" else array.dtype
-        )
-        data[array.mask] = _EMPTY.get(data.dtype.kind, "")
+        data: NDArray[Any] = array.astype(float if array.dtype.kind in "iub" else array.dtype).data
+        data[array.mask] = _EMPTY.get(data.dtype.kind, np.nan)
     except Exception as error:  # each library raises its own
-        raise TrajectoryError(
-            f"a {type(values).__name__} cannot be read as an array, expected numbers of shape "
-            f"(rows, sensors): {error}"
-        ) from error
+        kind = type(values).__name__
+        raise TrajectoryError(f"a {kind} is no array of (rows, sensors): {error}") from error
     return data
 
 
@@ -90,9 +76,9 @@ def as_numbers(values: Any) -> NDArray[np.float64]:
     if kind := _NOT_REAL.get(array.dtype.kind):
         raise TrajectoryError(f"there are {kind} ({array.dtype}), expected real numbers")
     try:
-        if array.dtype.kind == "O":
-            cells = (np.nan if is_missing(cell) else float(cell) for cell in array.flat)
-            return np.fromiter(cells, np.float64, array.size).reshape(array.shape)
-        return array.astype(np.float64, copy=False)
+        if array.dtype.kind != "O":
+            return array.astype(np.float64, copy=False)
+        cells = (np.nan if is_missing(cell) else float(cell) for cell in array.flat)
+        return np.fromiter(cells, np.float64, array.size).reshape(array.shape)
     except (TypeError, ValueError) as error:
         raise TrajectoryError(f"there are values that are no real numbers: {error}") from None
