@@ -40,9 +40,10 @@ def episode_columns(recording: Recording) -> tuple[str, ...]:
     recording
         What was recorded; with several topics it counts as one episode.
     """
-    if len(recording.topics) != 1 or not recording.topics[""].names:
+    topics = [topic for topic in recording.topics.values() if topic.names]
+    if len(topics) != 1:
         return ()
-    topic = recording.topics[""]
+    topic = topics[0]
     rows = min(topic.rows, max(1000, _CELLS // len(topic.names)))
     sample = topic.read(topic.names, 0, rows)
     counters = {n: x for n, cells in sample.items() if (x := _counter(cells)) is not None}
