@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from oodd_eval.data.parts import CALIBRATION, TRAIN, TWINS
 from oodd_eval.errors import TrajectoryError, UnknownNameError, UsageError
-from oodd_logs.kinds.times import orders_of, parse_times
+from oodd_logs.kinds.times import orders_of, parse_times, unit_in
 from oodd_logs.ledger import Fate, Item, Ledger
 from oodd_logs.marks import IntervalList, LabelValues, Mark, anomalous_cells, runs_of
 from oodd_logs.readers.cells import mixed
@@ -173,11 +173,10 @@ class StampedRows:
         for column in self._selection.times[topic] if rows.rows else ():
             # All at once: one cell may tell day from month in the others.
             cells = np.concatenate([cells for _start, cells in read_column(rows, column.column)])
-            arguments = (
-                column.quantity.unit,
-                self._order(cells),
-                f"{source}, column {column.column!r}",
-            )
+            unit = column.quantity.unit
+            if unit == "1" and len(self._selection.times[topic]) > 1:
+                unit = unit_in(column.column)
+            arguments = unit, self._order(cells), f"{source}, column {column.column!r}"
             try:
                 times = _seconds(cells, *arguments)
             except TrajectoryError:

@@ -444,7 +444,7 @@ def test_a_cell_of_text_is_the_exception_of_its_file(clean):
 def test_the_command_advises_only_scans_that_work(tmp_path, capsys, rows, text, advised):
     columns = times(rows) | {"q": process(rows)["q[rad]"]}
     if text:
-        columns["q"] = ["err" if i % 2 == 0 else x for i, x in enumerate(columns["q"])]
+        columns["q"] = ["note" if i % 2 == 0 else x for i, x in enumerate(columns["q"])]
     write(tmp_path / "logs" / "run.csv", columns)
     assert main(["data", "inspect", str(tmp_path / "logs")]) == 0
     out = " ".join(capsys.readouterr().out.split())

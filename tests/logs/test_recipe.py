@@ -16,6 +16,7 @@ licence = "CC BY 4.0"
 citation = "Doe 2024"
 time = "t[ms]"
 dates = "day first"
+episode = "run"
 rate = 100
 gap = 2.5
 sensors = ["q*[rad]", "speed = v"]

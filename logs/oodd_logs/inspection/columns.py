@@ -38,7 +38,7 @@ EXCEPTIONS: Final[Mapping[str, Fate]] = {TEXT: "held", _INFINITE: "held", _BEYON
 
 _FAR: Final = 1e6  # median deviations
 _JUMP: Final = 0.45  # share of the range, from which a step may be back to the beginning
-_NEAR: Final = 0.003  # share by which a period is rounded
+_NEAR: Final = 0.001  # share by which a period is rounded
 
 
 @dataclass(slots=True)
@@ -53,6 +53,8 @@ class Turns:
         Sum of the jumps, and of their sizes.
     moved
         Sum of all other steps.
+    small, walked
+        Number of the other steps in blocks with jumps, and the sum of their sizes.
     counts
         Whether all other steps are 1.
     """
@@ -62,6 +64,8 @@ class Turns:
     jumped: float = 0.0
     size: float = 0.0
     moved: float = 0.0
+    small: int = 0
+    walked: float = 0.0
     counts: bool = True
 
 
@@ -221,6 +225,8 @@ class ColumnFacts:
         turns.jumped += float(jumped.sum())
         turns.size += float(sizes[jumps].sum())
         turns.moved += moved - float(jumped.sum())
+        turns.small += len(others)
+        turns.walked += float(np.abs(others).sum())
         turns.wild += int((sizes > span / 8).sum()) - len(jumped)
         turns.counts = turns.counts and bool((others == 1).all())
         return bool(max(largest, -least) > 0.2 * sizes.sum())
@@ -283,19 +289,23 @@ class ColumnFacts:
         for period in _PERIODS[:2]:
             if abs(jump - period) < 0.08 * period and 0.9 * period < span < 1.3 * period:
                 return period
-        if jump < 0.8 * span:
+        usual_step = sum(turns.walked for turns in jumping) / max(1, sum(t.small for t in jumping))
+        if jump + 3 * usual_step < 0.98 * span:
             return 0.0
+        powers = [2.0**k for k in range(8, 33)]
+        if any(0.98 * power < span <= power for power in powers):
+            return min(power for power in powers if power >= span)
         # From the end to the beginning and through the range again, not to and fro.
         least = 0.3 * span
         through = [t for t in jumping if abs(t.jumped) > 0.6 * t.size and t.jumped * t.moved < 0]
         if 2 * sum(abs(turns.moved) > least for turns in through) < len(jumping):
             return 0.0
-        powers = [2.0**k for k in range(4, 33)] + [10.0**k for k in range(-3, 10)]
-        least, likely, most = max(span, jump), max(span, jump + slow), max(span, jump) + 3 * slow
-        usual = [p for p in (*_PERIODS, *powers) if 0.999 * least <= p <= 1.01 * most]
-        rounded = [float(f"{likely:.{digits}g}") for digits in range(1, 6)]
-        near = [p for p in rounded if abs(p / likely - 1) < _NEAR]
-        return float([*usual, *near, likely][0])
+        likely, most = max(span, jump + slow), max(span, jump) + 3 * usual_step
+        usual = [*_PERIODS, *(10.0**k for k in range(-3, 10))]
+        if fitting := [p for p in usual if 0.999 * max(span, jump) <= p <= 1.01 * most]:
+            return min(fitting, key=lambda period: abs(period - likely))
+        rounded = (float(f"{likely:.{digits}g}") for digits in range(1, 6))
+        return next((p for p in rounded if abs(p / likely - 1) < _NEAR), float(likely))
 
     @property
     def coarse(self) -> bool:
@@ -345,7 +355,7 @@ class ClockFacts:
             When a text is no time.
         """
         dated = columns[0].dtype.kind == "U"
-        orders = [order for cells in columns if dated for order in orders_of(cells)]
+        orders = orders_of(*columns) if dated else ()
         units = ("", "") if dated or len(columns) == 1 else ("s", "ns")
         unit = "date" if dated else units[0]
         readings: dict[str, ClockFacts] = {}

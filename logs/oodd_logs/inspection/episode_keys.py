@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oodd_logs.inspection.columns import parse_dates
+from oodd_logs.kinds.times import names_time, pairs_of
 from oodd_logs.recording import Column, Recording, Topic
 from oodd_logs.splitting import BEGINS, COUNTS, ENDS, last_part
 
@@ -85,12 +86,14 @@ def _starts_anew(name: str, counter: NDArray[np.float64]) -> bool:
 def _keys(topic: Topic, sample: Mapping[str, Column], restarts: Mapping[str, _Mask]) -> list[str]:
     """Return the likeliest key whose values follow one another, and another one that it needs."""
     ranked: list[tuple[bool, bool, list[str]]] = []
+    stamps = pairs_of(topic.names)
     for name, cells in sample.items():
         says_so = bool(_EPISODE.search(_words(name)))
         column = topic.read([name], 0, topic.rows)[name] if says_so else cells
         changes = column[1:] != column[:-1]
         episodes = int(changes.sum()) + 1
-        is_key = name not in restarts and not _NO_KEY.search(_words(name))
+        is_time = names_time(name) or name in stamps
+        is_key = name not in restarts and not _NO_KEY.search(_words(name)) and not is_time
         if not is_key or not 1 < episodes <= len(column) / _SHORTEST:
             continue
         explains = any(np.array_equal(falls, changes[: len(falls)]) for falls in restarts.values())
@@ -146,7 +149,9 @@ def _is_flag(cells: Column) -> bool:
 
 def _in_turn(sample: Mapping[str, Column], counters: Mapping[str, Column]) -> list[str]:
     """Return the column by whose values stamps rise that otherwise do not."""
-    for stamps in (x for n, x in counters.items() if COUNTS.search(_words(n))):
+    pairs = pairs_of([*sample])
+    parts = {*pairs, *pairs.values()}
+    for stamps in (x for n, x in counters.items() if COUNTS.search(_words(n)) and n not in parts):
         steps = np.diff(stamps)
         if (steps <= 0).mean() < _IN_TURN:
             continue

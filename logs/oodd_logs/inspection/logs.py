@@ -172,6 +172,7 @@ class Inspection:
     unreadable: list[str] = field(default_factory=list)
     ledger: Ledger = field(default_factory=Ledger)
     _spellings: dict[tuple[str, str], str] = field(default_factory=dict)
+    _rowless: list[tuple[str, str]] = field(default_factory=list)
     _written: dict[str, dict[str, list[str]]] = field(default_factory=dict)
 
     @cached_property
@@ -345,8 +346,20 @@ class Inspection:
                 names[name] = known
         return names
 
-    def settle(self) -> None:
-        """Name columns as most recordings do, and say what is not as in most of them."""
+    def settle(self, files: Sequence[str]) -> None:
+        """Name columns as most recordings do, and say what is not as in most of them.
+
+        Parameters
+        ----------
+        files
+            Names of all files.
+        """
+        there = {recording.file for recording in self.recordings}
+        for file in (f for f in files if f not in {*there, *self.unreadable, self.intervals}):
+            self.unreadable.append(file)
+            self.ledger.add("file", "dropped", "no rows", source=file)
+        for file, name in (pair for pair in self._rowless if pair[0] in there):
+            self.ledger.add("recording", "dropped", "no rows", source=f"{file}, {name}")
         new: dict[str, str] = {}
         for name, others in self._written.items():
             counts = {name: self.columns[name].recordings - sum(map(len, others.values()))}
@@ -374,8 +387,13 @@ class Inspection:
         for name, role in self.roles.items():
             if role and role not in {"times", "labels"}:
                 self.ledger.add("column", "dropped", role_of(role).reason, name=name)
+        for name in self.columns:
+            unit = split_unit(name)[1]
+            if unit and names_time(split_unit(name)[0]) and not unit_of(unit):
+                reason = f"{unit} is no unit of time, so that it has no times of rows"
+                self.ledger.add("column", "kept", reason, name=name)
         for name, unit in self.times.items():
-            clocks = [clock for _, clock in self.clocks(name)]
+            clocks = [r.clocks[name] for r in self.recordings if name in r.clocks]
             if unit not in {"date", "s", "ms", unit_in(name)}:
                 reason = f"its numbers are taken for {UNIT_NAMES[unit]} by their size"
                 self.ledger.add("column", "kept", reason, name=name)
@@ -385,7 +403,7 @@ class Inspection:
     def add(self, recording: Recording, file: str) -> None:
         """Read the rows of a recording in blocks and keep what is in them."""
         if not any(topic.rows for topic in recording.topics.values()):
-            self.ledger.add("file", "dropped", "no rows", source=file)
+            self._rowless.append((file, recording.name))
             return
         folder = self.path if self.path.name != file else self.path.parent
         source = recording.source.removeprefix(f"{folder}/")
@@ -527,6 +545,8 @@ def inspect_logs(
         except TrajectoryError as error:
             result.problems.append(str(error))
             result.unreadable.append(names[file])
+            reason = str(error).removeprefix(str(file)).lstrip(":, ")
+            result.ledger.add("file", "dropped", reason, source=names[file])
     exchanged = set() if "transpose" in options else _exchanged(later)
     result.transposed = [names[file] for file in files if file in exchanged]
     for file, recording in later:
@@ -535,13 +555,7 @@ def inspect_logs(
     for file in filter(exchanged.__contains__, files):
         for recording in reader.read(file, {**options, "transpose": True}):
             result.add(recording, names[file])
-    there = {recording.file for recording in result.recordings}
-    result.unreadable += [
-        names[file]
-        for file in files
-        if names[file] not in {*there, *result.unreadable, result.intervals}
-    ]
-    if not there:
+    if not result.recordings:
         no_rows = f"{str(path)!r} has no rows, expected some"
         raise TrajectoryError((result.problems or [no_rows])[0])
     order = {name: i for i, name in enumerate(names.values())}
@@ -554,7 +568,7 @@ def inspect_logs(
     shared = Counter(r.file for r in result.recordings if len(by_digest[r.digest]) > 1)
     result.shared = {file: n for file, n in shared.items() if file not in equal}
     result.continued = _continued(result.recordings)
-    result.settle()
+    result.settle([*order])
     return result
 
 

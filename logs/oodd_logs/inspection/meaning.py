@@ -163,7 +163,9 @@ def rate_of(logs: Inspection) -> str:
         ((name, unit),) = times.items()
         steps = [clock.steps.usual * SCALES[unit] for _, clock in logs.clocks(name)]
     steps = [step for step in steps if step > 0]
-    return f"{1 / max(s for s in steps if s * SLOW <= min(steps)):.4g}" if steps else "1"
+    step = max((s for s in steps if s * SLOW <= min(steps)), default=1.0)
+    is_round = abs(float(f"{step:.4g}") - step) < 1e-9 * step  # a row every 60 s, say
+    return f"{1 / step:.10g}" if is_round else f"{1 / step:.4g}"
 
 
 def gap_of(logs: Inspection) -> float:

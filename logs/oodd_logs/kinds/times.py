@@ -96,6 +96,8 @@ def names_time(name: str) -> bool:
     >>> names_time("header.stamp.sec"), names_time("rpm_t"), names_time("torque")
     (True, True, False)
     """
+    if len(name.strip()) > 1 and unit_of(name):  # a column called seconds
+        return True
     words = re.findall(r"[^\W\d_]+", name.lower())
     return not _TIME_WORDS.isdisjoint([*words, *(w for w in words_of(name) if len(w) > 1)])
 
@@ -180,25 +182,24 @@ def parse_times(column: Column, unit: str = "", order: str = "") -> NDArray[np.f
     return np.where(missing, np.nan, stamps.astype(np.int64) / 1e9 - offsets)
 
 
-def orders_of(column: Column) -> tuple[str, ...]:
+def orders_of(*columns: Column) -> tuple[str, ...]:
     """Return the orders of day and month that dates may have, the likelier first.
 
-    Empty where no date needs one.
+    Empty where no date needs one. Who writes am and pm writes the month first.
 
     >>> orders_of(np.array(["04/03/2025", "14/03/2025"])), orders_of(np.array(["2025-03-04"]))
     (('day first',), ())
     """
     pairs, halves = set(), False
-    for cell in {*column.tolist()}:
+    for cell in {cell for column in columns for cell in column.tolist()}:
         match = _TEXT.fullmatch(cell.strip().replace(",", "."))
         if match and match["first"] and len(match["first"]) < 3 and match["second"].isdigit():
             pairs.add((int(match["first"]), int(match["second"])))
-            halves = halves or bool(match["half"])
+        halves = halves or bool(match and match["half"])
     if not pairs:
         return ()
-    days = all(month <= 12 for _, month in pairs)
-    months = all(month <= 12 for month, _ in pairs)
-    orders = [*["day first"] * days, *["month first"] * months]
+    orders = ["day first"] if all(month <= 12 for _, month in pairs) else []
+    orders += ["month first"] if all(month <= 12 for month, _ in pairs) else []
     return tuple(orders[::-1] if halves else orders)
 
 
