@@ -213,6 +213,9 @@ class ColumnFacts:
         least, largest = steps.min(), steps.max()
         self.falls += int((steps < 0).sum()) if least < 0 else 0
         self.rises += int((steps > 0).sum()) if largest > 0 else 0
+        if sum(t.wild for t in self.turns[-3:]) > 16 + 4 * sum(t.jumps for t in self.turns[-3:]):
+            self.turns[-1].wild += 1  # noise, of which nothing more need be known
+            return False
         turns, moved = self.turns[-1], float(joined[-1] - joined[0])
         if max(largest, -least) <= span / 8:
             turns.moved += moved

@@ -1,5 +1,6 @@
 """Times: numbers in units from nanoseconds to days, dates of many countries, times of day."""
 
+import functools
 import re
 from collections.abc import Sequence
 from datetime import UTC, date, datetime
@@ -90,6 +91,7 @@ def unit_in(name: str) -> str:
     return unit_of(last) or unit_of((words_of(last) or [""])[-1] if last.isalpha() else "")
 
 
+@functools.lru_cache(maxsize=1 << 16)
 def names_time(name: str) -> bool:
     """Tell whether a column's name says that it has times.
 

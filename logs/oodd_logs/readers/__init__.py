@@ -277,8 +277,10 @@ def chosen(names: Iterable[str], options: Options, option: str = "topics") -> li
 
 
 def _guarded(topic: Topic, recording: Recording) -> Topic:
+    columns = dict.fromkeys(topic.names)
+
     def read(names: Sequence[str], start: int, stop: int) -> dict[str, Column]:
-        check_known(f"column of {recording.source}", topic.names, *names)
+        check_known(f"column of {recording.source}", columns, *names)
         if not names:
             return {}
         with readable(recording.source):
