@@ -18,7 +18,11 @@ _TURNS: Final = (2 * np.pi, 360.0)
 
 
 def _recognise(columns: Mapping[str, Any]) -> dict[str | tuple[str, ...], Any]:
-    return {name: None for name, facts in columns.items() if facts.period in _TURNS}
+    return {
+        name: f"wraps at {facts.period:.4g}"
+        for name, facts in columns.items()
+        if facts.period in _TURNS
+    }
 
 
 def _convert(globs: Sequence[str], sensors: Sequence[Quantity]) -> list[Conversion]:
