@@ -48,7 +48,7 @@ EVERY: Final = "every"
 """The part with all episodes of a source that `read_every_episode` made."""
 
 _ANOMALOUS: Final = "anomalous"  # where labels name no anomaly
-_SAMPLED: Final = 1 << 22  # values that tell usual deviations
+_SAMPLED: Final = 1 << 17  # values that tell usual deviations
 _BLOCK: Final = 1 << 16  # rows that are read at once
 _NO_FILES: Final = AnomalousFiles()
 _SHARED: Final = (TRAIN, CALIBRATION, TWINS)
@@ -975,7 +975,7 @@ def _say_far(source: EpisodeSource) -> None:
         for rows in source.blocks(facts):
             finite = np.where(np.isfinite(rows[:, :width]), rows[:, :width], np.nan)
             largest = np.fmax(largest, np.nanmax(np.abs(finite), axis=0, initial=0.0))
-            sampled.append(finite[::step])
+            sampled.append(finite[::step].copy())
     sample = np.concatenate(sampled)
     for d, sensor in enumerate(source.sensors):
         values = sample[~np.isnan(sample[:, d]), d]

@@ -14,7 +14,8 @@ from oodd_eval.names import counted
 Item = Literal["file", "recording", "episode", "column", "row", "cell", "mark"]
 Fate = Literal["kept", "held", "dropped", "changed"]
 
-_NAMED: Final = 6  # sources that a line of JSON lists
+_NAMED: Final = 3  # sources that a line names
+_EXAMPLES: Final = 6  # sources that an entry of JSON lists
 _LINES: Final = 12  # that a summary prints, and names in one of them
 _CELL: Final = 60  # characters of a cell that are quoted
 
@@ -61,12 +62,16 @@ class LedgerEntry:
         return " ".join(filter(None, parts))
 
     def where(self, total: int = 0) -> str:
-        """Return how many sources it is in, and the first place; `total` is that of all sources."""
-        of_all = f" of {total}" if total else ""
-        many = f" in {len(self.sources)}{of_all}: first" if len(self.sources) > 1 else ":"
+        """Return in how many sources it is, and in which, the first with its place.
+
+        `total` is the number of all sources, 0 where that is not known.
+        """
         if len(self.sources) == total > 1:
             return f" in all {total}"
-        return f"{many} {self.first}" if self.first else ""
+        many = f" in {len(self.sources)}{f' of {total}' if total else ''}: "
+        names = ", ".join(filter(None, [self.first, *[*self.sources][1:_NAMED]]))
+        names += f" and {len(self.sources) - _NAMED} more" * (len(self.sources) > _NAMED)
+        return f"{many if len(self.sources) > 1 else ': '}{names}" if names else ""
 
     def line(self, total: int = 0) -> str:
         """Return the entry as a line of text.
@@ -92,7 +97,7 @@ class LedgerEntry:
             "count": self.count,
             "sources": len(self.sources),
             "first": {"source": next(iter(self.sources), ""), "row": self.row, "cell": self.cell},
-            "examples": [*self.sources][:_NAMED],
+            "examples": [*self.sources][:_EXAMPLES],
         }
 
 

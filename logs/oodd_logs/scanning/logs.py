@@ -75,15 +75,16 @@ def read_logs(
     -------
     RecordedLogs
     """
-    reader, files, _ = recognised(path, form or (recipe.format if recipe else ""))
+    reader, files, others = recognised(path, form or (recipe.format if recipe else ""))
     root = path if path.is_dir() and files != [path] else path.parent
     logs: Inspection | None = None
     if recipe is None:
         logs = inspect_logs(path, reader.name, options or {})
         recipe = Recipe.parse(tomllib.loads(draft(logs)))
-        files = list(dict.fromkeys(root / recording.file for recording in logs.recordings))
         if window is None:
             window = 0 if len(logs.recordings) >= ENOUGH else window_of(logs)
+    if isinstance(recipe.intervals, str):
+        files = [file for file in files if file != root / recipe.intervals]
     if window is not None:
         recipe = replace(recipe, window=window, nominal=replace(recipe.nominal, window=None))
     if home is not None and files[0].is_relative_to(home):
@@ -91,6 +92,10 @@ def read_logs(
         root = root if listed else home
     with read_every_episode(recipe, root, files) as source:
         ledger = logs.ledger if logs else Ledger()
+        for ending, count in others.items():
+            ledger.add(
+                "file", "dropped", f"of another format, {ending or 'no ending'}", count=count
+            )
         ledger.complete(source.ledger)
         return RecordedLogs(
             list(source.episodes(EVERY)),
