@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oodd_eval.data.bounded import read_bytes
-from oodd_eval.errors import TrajectoryError, UnknownNameError
+from oodd_eval.errors import TrajectoryError, UnknownNameError, UsageError
 from oodd_eval.names import is_plain, natural
 from oodd_logs.recipe import Interval, Recipe
 from oodd_logs.recording import Column
@@ -270,7 +270,9 @@ class IntervalList:
     def __bool__(self) -> bool:
         return bool(self._rows)
 
-    def of_recording(self, path: Path, name: str, relative: str) -> list[Interval]:
+    def of_recording(
+        self, path: Path, name: str, relative: str, *, is_cut: bool = False
+    ) -> list[Interval]:
         """Return the intervals of a recording.
 
         Parameters
@@ -279,12 +281,27 @@ class IntervalList:
             Its file, and the path below the recipe's folder.
         name
             Of the recording, which may be a group of the file.
+        is_cut
+            Whether it is one of several episodes that a recipe makes of a table.
+
+        Raises
+        ------
+        UsageError
+            When an interval names a file that is cut: rows and times may be of any of its episodes.
         """
-        keys = dict.fromkeys([str(path), relative, path.name, path.stem, name])
+        plain = path.name.removesuffix(".gz")
+        keys = dict.fromkeys(
+            [str(path), relative, path.name, plain, path.stem, Path(plain).stem, name]
+        )
         parts = Path(relative).parts
         tails = ["/".join(parts[i:]) for i in range(1, len(parts))]
         names = [key for key in dict.fromkeys([*keys, *tails]) if key in self._rows]
         self._unused -= {*names}
+        if is_cut and (files := [key for key in names if key != name]):
+            raise UsageError(
+                f"{self._source} names {files[0]!r}, which is cut into episodes: name the episodes "
+                f"in its place, such as {name!r}, and their rows or times"
+            )
         return [interval for key in names for interval in self._rows[key]]
 
     def check_all_used(self, files: Iterable[str]) -> None:

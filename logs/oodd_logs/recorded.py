@@ -14,6 +14,7 @@ from oodd_logs.kinds.times import orders_of, parse_times, unit_in
 from oodd_logs.ledger import Fate, Item, Ledger
 from oodd_logs.marks import IntervalList, LabelValues, Mark, anomalous_cells, runs_of
 from oodd_logs.readers.cells import mixed
+from oodd_logs.readers.packed import stem
 from oodd_logs.recipe import Recipe, anomaly_name
 from oodd_logs.recording import Column, Recording
 from oodd_logs.rows import TopicRows, read_column
@@ -323,9 +324,17 @@ class StampedRows:
                 if (begin := self._position(start, column.topic, "begin"))
                 < (end := self._position(stop, column.topic, "end"))
             ]
-        for _, first, stop, kind in intervals.of_recording(
-            recorded.path, recorded.recording.name, recorded.relative
-        ):
+        name, is_cut = recorded.recording.name, recorded.recording.name != stem(recorded.path)
+        is_cut = is_cut and bool(recipe.episode)
+        try:
+            rows = intervals.of_recording(recorded.path, name, recorded.relative, is_cut=is_cut)
+        except UsageError:
+            if recipe.missing != "keep":
+                raise
+            rows = []
+            reason = "names a file that is cut into episodes, not one of these"
+            self._ledger.add("mark", "dropped", reason, source=recorded.label)
+        for _, first, stop, kind in rows:
             try:
                 marks.append(self._listed(first, stop, kind and anomaly_name(kind)))
             except (TrajectoryError, UsageError) as error:

@@ -1,5 +1,6 @@
 """A recipe makes episodes of recordings: columns, stamps, missing values, labels, parts."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -410,6 +411,38 @@ def test_labels_may_switch_back_and_end_before_the_file(tmp_path, values, keys):
     assert any("2 intervals with 3 anomalous rows" in line for line in said(source))
     with pytest.raises(TrajectoryError, match=r"odd\.csv has no anomalous row"):
         labelled([values[0]] * 10)
+
+
+@pytest.mark.parametrize(
+    ("name", "good", "bad", "keys", "message"),
+    [
+        (
+            "y",
+            1,
+            -1,
+            {},
+            r"-1 is the label of nominal rows in some .* nominal_label = \[1\], if .*most",
+        ),
+        ("y", -1, 1, {}, r"nominal_label = \[-1\], if that is nominal, as in most rows"),
+        ("y", "normal", "fault", {}, r"none of them is nominal .* nominal_label = \[\"normal\"\]"),
+        ("y", "N", "F", {}, r"'N' \(55 rows\), 'F' \(5 rows\)"),
+        ("y", "OK", "NOK", {}, r"nominal_label = \[\"OK\"\]"),
+        ("y", 1, 2, {}, r"none of them is nominal \(0, false, H, or nothing\)"),
+        ("y", 1, 0, {"nominal_label": "OK"}, r"nominal_label is \['OK'\]"),
+        ("healthy", 1, 0, {}, r"by its name 1 is nominal, .* write nominal_label = \[1\]"),
+    ],
+)
+def test_labels_that_do_not_say_what_is_nominal_are_refused(
+    tmp_path, name, good, bad, keys, message
+):
+    folder(tmp_path, **{name: [good] * 10})
+    write(tmp_path / "odd0.csv", table(10, 5, **{name: [good] * 10}))
+    write(tmp_path / "odd1.csv", table(10, 6, **{name: [good] * 5 + [bad] * 5}))
+    keys |= {"labels": name, "anomalous": {"leak": {"files": "odd1.csv"}}}
+    keys["nominal"] = {"train": "train*.csv", "calibration": "cal*.csv", "test": "odd0.csv"}
+    assert re.search(message, problem(tmp_path, **keys))
+    _, parts = read(tmp_path, **keys | {"nominal_label": good})
+    assert [e.intervals for e in parts["test/leak"]] == [((5, 10),)]
 
 
 @pytest.mark.parametrize("before", [False, True])

@@ -226,6 +226,13 @@ def test_labels_are_often_nominal_and_texts_name_their_nominal_value(tmp_path):
     recipe = draft_recipe(tmp_path)
     assert recipe.labels == ("health",)
     assert recipe.nominal_label == ("fine",)
+    write(tmp_path / "a.csv", process(200) | {"health": [1] * 150 + [-1] * 50})
+    assert "nominal_label = [1]  # as in most rows: check it" in draft(inspect_logs(tmp_path))
+    assert "nominal_label = [1], as in most rows" in topics(inspect_logs(tmp_path))["labels"]
+    write(tmp_path / "a.csv", process(200) | {"health": [1] * 100 + [-1] * 100})
+    assert "# nominal_label = [" in draft(inspect_logs(tmp_path))
+    write(tmp_path / "a.csv", process(200) | {"is_ok": [1] * 150 + [0] * 50})
+    assert draft_recipe(tmp_path).nominal_label == (1,)
     # One file with both kinds of rows stands below both.
     assert recipe.nominal.files == recipe.anomalous["fault"].files == ("a.csv",)
 

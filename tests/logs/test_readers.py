@@ -289,6 +289,28 @@ def test_the_convention_of_columns_is_taken_however_it_is_spelled(tmp_path):
     assert column_names(["x (2)", "x", "x"]) == ("x (2)", "x", "x (3)")
 
 
+@pytest.mark.parametrize("transpose", [False, True])
+def test_tables_packed_by_gzip_are_read(tmp_path, transpose):
+    text = "t {} 0 {} 1\nx {} 1.5 {} 2\n" if transpose else "t {} x\n0 {} 1.5\n1 {} 2\n"
+    for form, mark in (("csv", ","), ("text", "")):
+        path = tmp_path / f"run.1.{form[:3].replace('tex', 'txt')}.gz"
+        path.write_bytes(gzip.compress(text.replace("{}", mark).encode()))
+        (recording,) = recordings(form, path, transpose=transpose)
+        assert recording.name == "run.1"
+        assert rows(recording.topics[""]) == {"t": [0, 1], "x": [1.5, 2]}
+    assert logs.reader_for(path).name == "text"
+
+
+def test_what_unpacks_to_much_more_than_a_log_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("oodd_logs.readers.packed._SOME", 2**20)
+    parts = [*map(gzip.compress, (b"t,a\n1,2\n", b"\n" * 2**22, b"1,2"))]
+    for name, count in (("x.csv.gz", 2), ("y.csv.gz", 3), ("x.json.gz", 3), ("x.jsonl.gz", 2)):
+        # The size at the end is that of the last part.
+        (tmp_path / name).write_bytes(b"".join(parts[:count]))
+        with pytest.raises(TrajectoryError, match="unpacks to more than 1048576 bytes"):
+            recordings(name.split(".")[1], tmp_path / name)
+
+
 def test_ranges_of_a_file_of_many_blocks_are_its_rows(tmp_path, monkeypatch):
     rng = np.random.default_rng(0)
     values = rng.normal(size=(3000, 3))
@@ -1074,13 +1096,102 @@ def test_a_damaged_ulog_file_is_told(tmp_path, capsys):
     assert capsys.readouterr().out == ""
 
 
+# JSON files.
+
+T, A = [0.0, 0.1, 0.2, 0.3], [1.0, 2.0, 3.0, 4.0]
+STEPS = [{"t": t, "a": a} for t, a in zip(T, A, strict=True)]
+COLUMNS = {"t": T, "a": A}
+
+
+@pytest.mark.parametrize(
+    ("value", "fields"),
+    [
+        (COLUMNS | {"outcome": "success", "meta": {"robot": 3}},
+         {"outcome": "success", "meta.robot": 3}),
+        (STEPS, {}),
+        ({"success": True, "steps": STEPS}, {"success": True}),
+        ({"data": STEPS}, {}),
+        ({"data": COLUMNS, "fs": 10}, {"fs": 10}),
+        ({"trial": {"data": COLUMNS}}, {}),
+        ({k: dict(zip("0123", v, strict=True)) for k, v in COLUMNS.items()}, {}),
+        ({"columns": ["t", "a"], "index": [0, 1, 2, 3],
+          "data": [*map(list, zip(T, A, strict=True))]}, {}),
+    ],
+    ids=["columns", "rows", "steps", "rows below", "columns below", "deep", "frame", "split"],
+)  # fmt: skip
+def test_a_json_file_is_a_recording(tmp_path, value, fields):
+    for indent in (None, 1):
+        (recording,) = recordings(
+            "json", written(tmp_path, json.dumps(value, indent=indent), "x.json")
+        )
+        assert (recording.name, recording.fields) == ("x", fields)
+        assert rows(recording.topics[""]) == COLUMNS
+
+
+@pytest.mark.parametrize(
+    ("value", "names"),
+    [
+        ([{"steps": STEPS, "k": i} for i in range(2)], ["x-0", "x-1"]),
+        ([COLUMNS] * 5, [f"x-{i}" for i in range(5)]),
+        ({"trials": [COLUMNS, COLUMNS]}, ["x-0", "x-1"]),
+        ({"first": COLUMNS, "second": COLUMNS, "robot": "r"}, ["x-first", "x-second"]),
+    ],
+)
+def test_a_json_file_may_hold_several_episodes(tmp_path, value, names):
+    episodes = recordings("json", written(tmp_path, json.dumps(value), "x.json"))
+    assert [episode.name for episode in episodes] == names
+    assert all(rows(episode.topics[""]) == COLUMNS for episode in episodes)
+
+
+def test_tables_of_other_columns_in_a_json_file_are_topics(tmp_path):
+    def topics(value):
+        (recording,) = recordings("json", written(tmp_path, json.dumps(value), "x.json"))
+        return {name: topic.names for name, topic in recording.topics.items()}
+
+    assert topics({"imu": STEPS, "gps": [{"t": 0, "lat": 1}] * 2}) == {
+        "imu": ("t", "a"), "gps": ("t", "lat"),
+    }  # fmt: skip
+    assert topics({"imu": {"x": T}, "arm": {"q": A}}) == {"": ("imu.x", "arm.q")}
+    assert topics({"observations": [T, A], "actions": [[1.0]]}) == {
+        "": (*(f"obs:sensor {i}" for i in range(4)), "action:action 0")
+    }
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (
+            '{"rate": 10, "names": ["a", "b"]}',
+            "an object with rate, names: expected lists of equal",
+        ),
+        ("[1, 2, 3]", r"holds \[1, 2, 3\]: expected"),
+        ("3", "holds 3: expected"),
+        ('{"a": 1,', "JSONDecodeError"),
+        ("", "JSONDecodeError"),
+        ("[" * 100_000, "RecursionError"),
+    ],
+)
+def test_json_without_rows_is_refused(tmp_path, content, message):
+    with pytest.raises(TrajectoryError, match=message):
+        recordings("json", written(tmp_path, content, "x.json"))
+
+
+def test_lines_of_json_by_another_name_are_read(tmp_path):
+    path = written(tmp_path, "\n".join(map(json.dumps, STEPS)), "x.json")
+    assert rows(table("json", path)) == COLUMNS
+    (recording,) = recordings(
+        "json", written(tmp_path, json.dumps(COLUMNS | {"gains": [1, 2]}), "x.json")
+    )
+    assert "column gains, a list of another length than the rows" in recording.ledger.lines()[0]
+
+
 # Readers in general.
 
 
 def test_a_format_says_by_what_it_is_recognised():
     known = readers()
-    assert {*known} == {"csv", "text", "json", "jsonl", "parquet", "lerobot", "mcap", "rosbag", "ulog",
-                        "mat", "hdf5", "numpy", "minari"}  # fmt: skip
+    assert {*known} == {"csv", "text", "json", "jsonl", "parquet", "lerobot", "mcap", "rosbag",
+                        "ulog", "mat", "hdf5", "numpy", "minari"}  # fmt: skip
     endings = [suffix for reader in known.values() for suffix in reader.suffixes]
     assert len(endings) == len({*endings})
     assert all(reader.suffixes or reader.directory_markers for reader in known.values())

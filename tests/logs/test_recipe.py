@@ -19,6 +19,7 @@ dates = "day first"
 episode = "run"
 rate = 100
 gap = 2.5
+episode = ["robot", "run"]
 sensors = ["q*[rad]", "speed = v"]
 actions = "cmd*"
 reward = "r"
