@@ -167,6 +167,8 @@ TICKS = np.cumsum(np.random.default_rng(1).uniform(5, 10, len(RUN)))
         ({"t": CLOCK, "phase": RUN, "phase_step": STEP}, []),
         ({"t": CLOCK, "fault": (RUN > 6) * 1.0}, []),
         ({"t": CLOCK, "command": 10 * RUN}, []),
+        ({"nsec": CLOCK % 1 * 1e9, "sec": CLOCK // 1}, []),
+        ({"lap": RUN, "t": CLOCK}, []),
         ({"done": (RUN > 6) * 1.0, "t": CLOCK}, []),
         ({"done": np.append(np.zeros(len(RUN) - 1), 1.0)}, []),
         ({"t": np.sort(np.round(np.random.default_rng(2).uniform(0, 100, len(RUN)), 1)),
@@ -176,7 +178,11 @@ TICKS = np.cumsum(np.random.default_rng(1).uniform(5, 10, len(RUN)))
 def test_what_tells_episodes_apart_is_proposed(columns, expected):
     rows = len(next(iter(columns.values())))
     noise = np.random.default_rng(3).normal(size=rows)
-    assert [*episode_columns(recording(x=noise, **columns))] == expected
+    table = recording(x=noise, **columns)
+    assert [*episode_columns(table)] == expected
+    bag = Recording("bag", "bag", {"/topic": table.topics[""]})
+    assert [*episode_columns(bag)] == expected
+    assert not episode_columns(Recording("bag", "bag", {"": table.topics[""], **bag.topics}))
 
 
 def table_of_runs(runs, rows=60, **more):

@@ -21,12 +21,16 @@ _SHORTEST: Final = 8  # rows of an episode, in the mean
 _STEADY: Final = 0.9  # share of rows in which a counter makes its usual step
 _IN_TURN: Final = 0.2  # share of rows whose stamp does not rise, where several robots write
 _EPISODE: Final = re.compile(
-    r"(?:^|[^a-z])(?:run|episode|ep|trial|traj|trajectory|rollout|demo|demonstration|experiment|lap"
+    r"(?:^|[^a-z])(?:run|episode|ep|trial|traj|trajectory|rollout|demo|demonstration|experiment"
     r"|flight)(?:[^a-z]*(?:id|index|idx|no|nr|num|number|name))?$"
 )
 _NO_KEY: Final = re.compile(
     r"anomal|fault|fail|label|health|attack|alarm|error|class|status|phase|stage|state|mode|signal"
     r"|variable|channel|topic|metric|tag$|parameter|sensor|flag"
+)
+_OF_TIME: Final = re.compile(
+    r"(?:^|[^a-z])(?:[num]?s|[num]?secs?|(?:nano|micro|milli)?seconds?|nanos?|micros?|millis?|minutes?"
+    r"|hours?|days?|dates?|months?|years?|time|stamp|epoch)(?:$|[^a-z])"
 )
 _STEP: Final = re.compile(r"(?:^|[^a-z])(?:step|timestep|frame|tick)s?(?:$|[^a-z])")
 
@@ -92,8 +96,9 @@ def _keys(topic: Topic, sample: Mapping[str, Column], restarts: Mapping[str, _Ma
         column = topic.read([name], 0, topic.rows)[name] if says_so else cells
         changes = column[1:] != column[:-1]
         episodes = int(changes.sum()) + 1
-        is_time = names_time(name) or name in stamps
-        is_key = name not in restarts and not _NO_KEY.search(_words(name)) and not is_time
+        # Whole seconds rise where fractions start anew, and so do days.
+        other = _NO_KEY.search(_words(name)) or _OF_TIME.search(_words(name))
+        is_key = name not in restarts and not other
         if not is_key or not 1 < episodes <= len(column) / _SHORTEST:
             continue
         explains = any(np.array_equal(falls, changes[: len(falls)]) for falls in restarts.values())
