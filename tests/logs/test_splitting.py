@@ -161,6 +161,10 @@ TICKS = np.cumsum(np.random.default_rng(1).uniform(5, 10, len(RUN)))
           "sample": np.tile(np.arange(200.0), 6)}, ["fault", "run"]),
         ({"t": np.repeat(np.arange(300.0), 3), "robot": np.array(["a", "b", "c"] * 300)},
          ["robot"]),
+        ({"t": np.arange(900.0), "robot": np.arange(900) % 2 + 1.0,
+          "trial": np.arange(900) // 90 * 1.0}, ["robot", "trial"]),
+        ({"t": np.tile(np.repeat(np.arange(45.0), 2), 10), "device": np.arange(900) % 2 * 1.0,
+          "run": np.arange(900) // 90 * 1.0}, ["device", "run"]),
         # One episode:
         ({"t": STEP / 10}, []),  # where the time falls, gap cuts
         ({"t": CLOCK, "encoder": TICKS % 1024, "turns": TICKS // 1024}, []),
@@ -169,6 +173,8 @@ TICKS = np.cumsum(np.random.default_rng(1).uniform(5, 10, len(RUN)))
         ({"t": CLOCK, "command": 10 * RUN}, []),
         ({"nsec": CLOCK % 1 * 1e9, "sec": CLOCK // 1}, []),
         ({"lap": RUN, "t": CLOCK}, []),
+        ({"engine": np.round(20 * NOISE), "t": CLOCK}, []),
+        ({"run": (RUN > 6) * 1.0, "t": CLOCK}, []),
         ({"done": (RUN > 6) * 1.0, "t": CLOCK}, []),
         ({"done": np.append(np.zeros(len(RUN) - 1), 1.0)}, []),
         ({"t": np.sort(np.round(np.random.default_rng(2).uniform(0, 100, len(RUN)), 1)),

@@ -5,7 +5,7 @@ robots that write in turn each have times that rise. Flags are known by their na
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -20,9 +20,10 @@ _CELLS: Final = 1 << 20  # that are looked at
 _SHORTEST: Final = 8  # rows of an episode, in the mean
 _STEADY: Final = 0.9  # share of rows in which a counter makes its usual step
 _IN_TURN: Final = 0.2  # share of rows whose stamp does not rise, where several robots write
+_NUMBER: Final = r"(?:[^a-z]*(?:id|index|idx|no|nr|num|number|name))?$"
 _EPISODE: Final = re.compile(
     r"(?:^|[^a-z])(?:run|episode|ep|trial|traj|trajectory|rollout|demo|demonstration|experiment"
-    r"|flight)(?:[^a-z]*(?:id|index|idx|no|nr|num|number|name))?$"
+    r"|flight)" + _NUMBER
 )
 _NO_KEY: Final = re.compile(
     r"anomal|fault|fail|label|health|attack|alarm|error|class|status|phase|stage|state|mode|signal"
@@ -31,6 +32,10 @@ _NO_KEY: Final = re.compile(
 _OF_TIME: Final = re.compile(
     r"(?:^|[^a-z])(?:[num]?s|[num]?secs?|(?:nano|micro|milli)?seconds?|nanos?|micros?|millis?|minutes?"
     r"|hours?|days?|dates?|months?|years?|time|stamp|epoch)(?:$|[^a-z])"
+)
+_WRITER: Final = re.compile(
+    r"(?:^|[^a-z])(?:robot|vehicle|machine|device|agent|drone|rover|car|truck|turbine|engine|unit|env"
+    r"|asset)" + _NUMBER
 )
 _STEP: Final = re.compile(r"(?:^|[^a-z])(?:step|timestep|frame|tick)s?(?:$|[^a-z])")
 
@@ -53,13 +58,10 @@ def episode_columns(recording: Recording) -> tuple[str, ...]:
     sample = topic.read(topic.names, 0, rows)
     counters = {n: x for n, cells in sample.items() if (x := _counter(cells)) is not None}
     restarts = {n: np.diff(x) < 0 for n, x in counters.items() if _starts_anew(n, x)}
-    proposals = (
-        _keys(topic, sample, restarts),
-        _flags(topic),
-        _in_turn(sample, counters),
-        [n for n in restarts if _STEP.search(_words(n)) and not _NO_KEY.search(_words(n))][:1],
-    )
-    return tuple(next(filter(None, proposals), ()))
+    keys = _keys(topic, sample, restarts)
+    writer = _in_turn(sample, counters, keys)
+    steps = [n for n in restarts if _STEP.search(_words(n)) and not _NO_KEY.search(_words(n))]
+    return (*writer, *(keys or _flags(topic) or ([] if writer else steps[:1])))
 
 
 def _words(name: str) -> str:
@@ -102,11 +104,12 @@ def _keys(topic: Topic, sample: Mapping[str, Column], restarts: Mapping[str, _Ma
         if not is_key or not 1 < episodes <= len(column) / _SHORTEST:
             continue
         explains = any(np.array_equal(falls, changes[: len(falls)]) for falls in restarts.values())
-        if not explains and not says_so:
+        values = column[np.append(0, np.flatnonzero(changes) + 1)]
+        distinct = {*values.tolist()}
+        # A machine that runs or not is no number of a run.
+        if not explains and (not says_so or distinct <= {0.0, 1.0}):
             continue
-        heads = np.append(0, np.flatnonzero(changes) + 1)
-        values = column[heads]
-        partner = [] if len({*values.tolist()}) == episodes else _partner(sample, name, changes)
+        partner = [] if len(distinct) == episodes else _partner(sample, name, changes)
         if partner is not None and (explains or not partner):
             ranked.append((not says_so, not _counts_up(values), [*partner, name]))
     return min(ranked, key=lambda row: row[:2], default=(True, True, []))[2]
@@ -152,22 +155,41 @@ def _is_flag(cells: Column) -> bool:
     return not (flagged[1:] & flagged[:-1]).any()
 
 
-def _in_turn(sample: Mapping[str, Column], counters: Mapping[str, Column]) -> list[str]:
-    """Return the column by whose values stamps rise that otherwise do not."""
-    pairs = pairs_of([*sample])
-    parts = {*pairs, *pairs.values()}
-    for stamps in (x for n, x in counters.items() if COUNTS.search(_words(n)) and n not in parts):
-        steps = np.diff(stamps)
-        if (steps <= 0).mean() < _IN_TURN:
+def _in_turn(
+    sample: Mapping[str, Column], counters: Mapping[str, Column], keys: Sequence[str]
+) -> list[str]:
+    """Return the column that names who wrote each row, where several write in turn."""
+    # Their stamps do not rise from row to row, but from each one's row to the next.
+    group = _codes([sample[name] for name in keys if name in sample])
+    clocks = [x for name, x in counters.items() if COUNTS.search(_words(name))]
+    unclear = [x for x in clocks if _rising(x, group) < 1 - _IN_TURN]
+    for name, cells in sample.items():
+        _, counts = np.unique(cells, return_counts=True)
+        is_key = name not in keys and not _NO_KEY.search(_words(name))
+        if not is_key or not 1 < len(counts) <= len(cells) / _SHORTEST:
             continue
-        for name, cells in sample.items():
-            if _NO_KEY.search(_words(name)) or cells is stamps:
-                continue
-            values, codes = np.unique(cells, return_inverse=True)
-            if not 1 < len(values) <= len(cells) / _SHORTEST:
-                continue
-            order = np.argsort(codes, kind="stable")
-            same = np.diff(codes[order]) == 0
-            if (np.diff(stamps[order])[same] > 0).all():
-                return [name]
+        takes_turns = (cells[1:] != cells[:-1]).mean() >= _STEADY and max(counts) < 2 * min(counts)
+        codes = _codes([sample[n] for n in keys if n in sample] + [cells])
+        if (takes_turns and _WRITER.search(_words(name))) or any(
+            _rising(x, codes) == 1 for x in unclear
+        ):
+            return [name]
     return []
+
+
+def _codes(columns: Sequence[Column]) -> NDArray[np.intp] | None:
+    """Return the number of each row's combination of values; None without columns."""
+    codes = None
+    for cells in columns:
+        values, inverse = np.unique(cells, return_inverse=True)
+        codes = inverse if codes is None else codes * len(values) + inverse
+    return codes
+
+
+def _rising(counter: Column, group: NDArray[np.intp] | None) -> float:
+    """Return the share of rows with more than the row before in their group."""
+    if group is None:
+        return float((np.diff(counter) > 0).mean())
+    order = np.argsort(group, kind="stable")
+    same = np.diff(group[order]) == 0
+    return float((np.diff(counter[order]) > 0)[same].mean()) if same.any() else 0.0
