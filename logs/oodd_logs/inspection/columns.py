@@ -8,7 +8,7 @@ float32 cannot tell apart.
 import contextlib
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -36,6 +36,7 @@ _BEYOND: Final = "a million times as far from the median as usual"
 EXCEPTIONS: Final[Mapping[str, Fate]] = {TEXT: "held", _INFINITE: "held", _BEYOND: "kept"}
 """What becomes of cells that are no such values as most others of a column, by the reason."""
 
+_WHOLE: Final = np.zeros(1, np.int64)  # cells of one recording
 _FAR: Final = 1e6  # median deviations
 _JUMP: Final = 0.45  # share of the range, from which a step may be back to the beginning
 _NEAR: Final = 0.001  # share by which a period is rounded
@@ -93,11 +94,13 @@ class ColumnFacts:
     span
         Range of the numbers on which `turns` are based.
     turns
-        Of each recording: steps of about the range, the sum of these and of their sizes, other
-        steps of more than an eighth of it, the sum and the sizes of the small ones, the least and
-        the largest of these.
-    source, run, at_start, last
-        The recording, its missing cells before the next one, whether there was none but these, and
+        Steps by their sizes, of each recording, or block of several.
+    sources, firsts
+        The recordings whose cells are taken, and the first cell of each.
+    recent, filled
+        Of each of these, cells by value as in `values`, and whether it has a number.
+    run, at_start, last
+        Missing cells before the next one, whether there was none but these in the recording, and
         its last number.
     """
 
@@ -114,16 +117,29 @@ class ColumnFacts:
     rises: int = 0
     span: float = 0.0
     turns: list[Turns] = field(default_factory=list)
-    source: str = ""
+    sources: Sequence[str] = ()
+    firsts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(1, np.int64))
+    recent: list[Counter[float | str]] = field(default_factory=list)
+    filled: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(1, np.bool_))
     run: int = 0
     at_start: bool = True
     last: float = math.nan
 
-    def begin(self, source: str = "") -> None:
-        """Say that the next cells are of another recording."""
-        self.recordings += 1
+    def begin(self, sources: Sequence[str] = ("",), firsts: NDArray[np.int64] = _WHOLE) -> None:
+        """Say that the next cells are of another recording, or of several in one block.
+
+        Parameters
+        ----------
+        sources
+            Names of the recordings.
+        firsts
+            Position of the first cell of each.
+        """
+        self.recordings += len(sources)
         self.turns.append(Turns())
-        self.source, self.run, self.at_start, self.last = source, 0, True, math.nan
+        self.sources, self.firsts = sources, firsts
+        self.recent, self.filled = [Counter() for _ in sources], np.zeros(len(sources), np.bool_)
+        self.run, self.at_start, self.last = 0, True, math.nan
 
     def leap(self) -> None:
         """Say that rows before the next cells were left out."""
@@ -139,9 +155,9 @@ class ColumnFacts:
             if 2 * words.sum() >= len(cells) - (np.isnan(numbers) & ~words).sum():
                 absent = np.strings.str_len(cells) == 0
                 self._count_missing(absent)
-                self._count_values(cells[~absent])
+                self._count_values(cells, ~absent)
                 return
-            self._count_values(cells[words])
+            self._count_values(cells, words)
         absent = ~np.isfinite(numbers)
         self._count_missing(absent)
         present = numbers
@@ -150,9 +166,11 @@ class ColumnFacts:
             self._except(_INFINITE, np.isinf(numbers), cells, start)
         if not len(present):
             return
-        self._count_values(present)
+        self._count_values(numbers, ~absent)
         self.numbers.add(present)
-        if self._count_steps(present):
+        self.filled |= np.logical_or.reduceat(~absent, self.firsts)
+        inside = np.diff(np.searchsorted(self.firsts, np.flatnonzero(~absent), side="right")) == 0
+        if self._count_steps(present, inside if len(self.sources) > 1 else None):
             away = np.abs(numbers - np.median(present))
             usual = np.median(away[~absent])
             beyond = ~absent & (away > _FAR * usual)
@@ -160,13 +178,18 @@ class ColumnFacts:
                 self._except(_BEYOND, beyond, cells, start)
 
     def _except(self, reason: str, cells: NDArray[np.bool_], values: Column, start: int) -> None:
-        """Keep how many cells of the recording are no such values as the others, and the first."""
-        if not cells.any():
-            return
-        first = int(cells.argmax())
-        place = 0, start + first, f"{values[first]!s:.60}"
-        count, row, text = self.exceptions.get((reason, self.source), place)
-        self.exceptions[reason, self.source] = (count + int(cells.sum()), row, text)
+        """Keep how many cells of a recording are no such values as the others, and the first."""
+        for i, rows in self._by_recording(np.flatnonzero(cells)):
+            source, row = self.sources[i], int(rows[0])
+            place = 0, start + row - int(self.firsts[i]), f"{values[row]!s:.60}"
+            count, first, text = self.exceptions.get((reason, source), place)
+            self.exceptions[reason, source] = (count + len(rows), first, text)
+
+    def _by_recording(self, cells: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64]]]:
+        """Yield the number of each recording with some of these cells, and its cells."""
+        recordings = np.searchsorted(self.firsts, cells, side="right") - 1
+        for i in np.unique(recordings).tolist():
+            yield i, cells[recordings == i]
 
     def _count_missing(self, absent: NDArray[np.bool_]) -> None:
         if not absent.any():
@@ -174,32 +197,51 @@ class ColumnFacts:
             self.run, self.at_start = 0, self.at_start and not len(absent)
             return
         self.missing += int(absent.sum())
-        for start, stop in runs_of(absent):
-            length = stop - start + (self.run if start == 0 else 0)
-            if self.at_start and start == 0:
-                self.leading = max(self.leading, length)
-            else:
-                self.longest = max(self.longest, length)
-        trailing = int(absent[::-1].argmin()) if not absent.all() else len(absent)
-        self.run = trailing + (self.run if trailing == len(absent) else 0)
-        self.at_start = self.at_start and trailing == len(absent)
+        for part in np.split(absent, self.firsts[1:]):
+            if len(self.sources) > 1:
+                self.run, self.at_start = 0, True
+            for start, stop in runs_of(part):
+                length = stop - start + (self.run if start == 0 else 0)
+                if self.at_start and start == 0:
+                    self.leading = max(self.leading, length)
+                else:
+                    self.longest = max(self.longest, length)
+            trailing = int(part[::-1].argmin()) if not part.all() else len(part)
+            self.run = trailing + (self.run if trailing == len(part) else 0)
+            self.at_start = self.at_start and trailing == len(part)
 
-    def _count_values(self, present: Column) -> None:
-        if self.values is None:
+    def _count_values(self, cells: Column, where: NDArray[np.bool_]) -> None:
+        if self.values is None or not where.any():
             return
+        present = cells[where]
         if len({*present[:1000].tolist()}) <= FEW:
-            values, counts = np.unique(present, return_counts=True)
+            values, codes = np.unique(present, return_inverse=True)
             if len(values) <= FEW:
-                self.values.update(dict(zip(values.tolist(), counts.tolist(), strict=True)))
+                recordings = np.searchsorted(self.firsts, np.flatnonzero(where), side="right") - 1
+                size = len(self.sources) * len(values)
+                counts = np.bincount(recordings * len(values) + codes, minlength=size)
+                for recent, of_recording in zip(
+                    self.recent, counts.reshape(-1, len(values)).tolist(), strict=True
+                ):
+                    pairs = zip(values.tolist(), of_recording, strict=True)
+                    recent.update({value: count for value, count in pairs if count})
+                self.values.update(
+                    dict(zip(values.tolist(), np.bincount(codes).tolist(), strict=True))
+                )
                 if len(self.values) <= FEW:
                     return
         self.values = None
 
-    def _count_steps(self, numbers: NDArray[np.float64]) -> bool:
-        """Count steps by their sizes; tell whether one is much larger than the others."""
+    def _count_steps(self, numbers: NDArray[np.float64], inside: NDArray[np.bool_] | None) -> bool:
+        """Count steps by their sizes; tell whether one is much larger than the others.
+
+        Steps count that are inside a recording.
+        """
         joined = numbers if math.isnan(self.last) else np.append(self.last, numbers)
         with np.errstate(all="ignore"):
             steps = np.diff(joined)
+        if inside is not None:
+            steps = steps[inside]
         self.last = float(numbers[-1])
         self.steps += len(steps)
         span = self.numbers.high - self.numbers.low
@@ -216,7 +258,7 @@ class ColumnFacts:
         if sum(t.wild for t in self.turns[-3:]) > 16 + 4 * sum(t.jumps for t in self.turns[-3:]):
             self.turns[-1].wild += 1  # noise, of which nothing more need be known
             return False
-        turns, moved = self.turns[-1], float(joined[-1] - joined[0])
+        turns, moved = self.turns[-1], float(steps.sum())
         if max(largest, -least) <= span / 8:
             turns.moved += moved
             turns.counts = turns.counts and least == largest == 1

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oodd_logs.inspection.columns import parse_dates
-from oodd_logs.kinds.times import names_time, pairs_of
+from oodd_logs.kinds.times import pairs_of
 from oodd_logs.recording import Column, Recording, Topic
 from oodd_logs.splitting import BEGINS, COUNTS, ENDS, last_part
 
@@ -55,7 +55,9 @@ def episode_columns(recording: Recording) -> tuple[str, ...]:
         return ()
     topic = topics[0]
     rows = min(topic.rows, max(1000, _CELLS // len(topic.names)))
-    sample = topic.read(topic.names, 0, rows)
+    stamps = pairs_of(topic.names)  # whole seconds, and what is added to them
+    names = [name for name in topic.names if name not in {*stamps, *stamps.values()}]
+    sample = topic.read(names, 0, rows)
     counters = {n: x for n, cells in sample.items() if (x := _counter(cells)) is not None}
     restarts = {n: np.diff(x) < 0 for n, x in counters.items() if _starts_anew(n, x)}
     keys = _keys(topic, sample, restarts)
@@ -92,7 +94,6 @@ def _starts_anew(name: str, counter: NDArray[np.float64]) -> bool:
 def _keys(topic: Topic, sample: Mapping[str, Column], restarts: Mapping[str, _Mask]) -> list[str]:
     """Return the likeliest key whose values follow one another, and another one that it needs."""
     ranked: list[tuple[bool, bool, list[str]]] = []
-    stamps = pairs_of(topic.names)
     for name, cells in sample.items():
         says_so = bool(_EPISODE.search(_words(name)))
         column = topic.read([name], 0, topic.rows)[name] if says_so else cells

@@ -2,9 +2,10 @@
 
 import contextlib
 import hashlib
+import itertools
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -35,6 +36,8 @@ from oodd_logs.recording import Column, Recording, Topic
 from oodd_logs.selecting import plain_name, split_unit
 from oodd_logs.splitting import split_recording
 
+_SHORT: Final = 512  # rows up to which recordings are counted together
+_PENDING: Final = 256  # recordings
 _CELLS: Final = 1 << 20  # of the rows that are in memory at once
 _TABLES: Final = 3  # recordings in which columns are looked for that tell episodes apart
 SLOW: Final = 0.1
@@ -54,6 +57,29 @@ _LABEL: Final = re.compile(
 )
 _DAY: Final = 86400  # seconds
 _INTERVALS: Final = ({"file", "start"}, {"file", "onset"})
+
+
+class _RowHashes:
+    """What tells the rows of a recording from those of others: all of them, the first, the last."""
+
+    def __init__(self) -> None:
+        self.digest, self._names = hashlib.sha256(), [""]
+        self.head = self.tail = np.empty(0, np.uint64)
+
+    def begin(self, block: Mapping[str, Column], times: Collection[str]) -> None:
+        """Choose the columns that tell rows apart, from the first block of a topic."""
+        numbers = (n for n in block if block[n].dtype.kind == "f" and n not in times)
+        self._names = sorted(n for n in numbers if len({*block[n][:1000].tolist()}) > FEW)
+
+    def add(self, block: Mapping[str, Column]) -> None:
+        """Take the next rows of the topic."""
+        for cells in block.values():
+            self.digest.update(cells.tobytes())
+        hashes = np.zeros(len(next(iter(block.values()))) if self._names else 0, np.uint64)
+        for name in self._names:
+            hashes = hashes * _PRIME ^ np.ascontiguousarray(block[name]).view(np.uint64)
+        self.head = np.append(self.head, hashes[: _ENDS - len(self.head)])
+        self.tail = np.append(self.tail, hashes)[-_ENDS:]
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +124,7 @@ class RecordingFacts:
     added: Mapping[str, str]
     values: Mapping[str, Mapping[float | str, int]]
     fields: Mapping[str, Any]
-    empty: frozenset[str]
+    empty: set[str]
     digest: str
     head: NDArray[np.uint64]
     tail: NDArray[np.uint64]
@@ -116,7 +142,7 @@ class RecordingFacts:
             clocks={new.get(name, name): clock for name, clock in self.clocks.items()},
             added={new.get(name, name): new.get(n, n) for name, n in self.added.items()},
             values={new.get(name, name): values for name, values in self.values.items()},
-            empty=frozenset(new.get(name, name) for name in self.empty),
+            empty={new.get(name, name) for name in self.empty},
         )
 
 
@@ -172,6 +198,9 @@ class Inspection:
     unreadable: list[str] = field(default_factory=list)
     ledger: Ledger = field(default_factory=Ledger)
     _spellings: dict[tuple[str, str], str] = field(default_factory=dict)
+    _pending: list[tuple[str, dict[str, Column], dict[str, Counter[float | str]], set[str]]] = (
+        field(default_factory=list)
+    )
     _rowless: list[tuple[str, str]] = field(default_factory=list)
     _written: dict[str, dict[str, list[str]]] = field(default_factory=dict)
 
@@ -354,6 +383,7 @@ class Inspection:
         files
             Names of all files.
         """
+        self._work_off()
         there = {recording.file for recording in self.recordings}
         for file in (f for f in files if f not in {*there, *self.unreadable, self.intervals}):
             self.unreadable.append(file)
@@ -407,53 +437,49 @@ class Inspection:
             return
         folder = self.path if self.path.name != file else self.path.parent
         source = recording.source.removeprefix(f"{folder}/")
-        columns: dict[str, ColumnFacts] = {}
-        before: dict[str, Counter[float | str]] = {}
-        numbers_before: dict[str, int] = {}
+        columns: list[str] = []
         clocks: dict[str, ClockFacts] = {}
         added: dict[str, str] = {}
-        digest = hashlib.sha256()
-        head = tail = np.empty(0, np.uint64)
-        topics = recording.topics.items()
+        values: dict[str, Counter[float | str]] = {}
+        empty: set[str] = set()
+        rows, topics = _RowHashes(), recording.topics.items()
+        is_short = len(topics) == 1 and max(topic.rows for _, topic in topics) <= _SHORT
+        if not is_short:
+            self._work_off()
         for topic_name, topic in topics:
             below = f"{topic_name}." if topic_name else ""
             names = self._names(topic, below, source)
-            for name in names.values():
-                columns[name] = self.columns.setdefault(name, ColumnFacts())
-                before[name] = Counter(columns[name].values or {})
-                numbers_before[name] = columns[name].numbers.count
-                columns[name].begin(source)
+            columns += names.values()
+            facts = {n: self.columns.setdefault(name, ColumnFacts()) for n, name in names.items()}
             likely: list[tuple[str, ...]] = []
             stamps: dict[str, list[Column]] = {}
-            numbered: list[NDArray[np.int64]] = []
-            hashed: list[str] = []
-            following = 0
+            numbered: list[NDArray[np.int64]] = [np.zeros(0, np.int64)]
             for start, block in _blocks(topic):
                 if not start:
                     likely = _time_columns(topic, block)
-                    stamps = {name: [] for names in likely for name in names}
-                    numbers = (n for n in block if block[n].dtype.kind == "f" and n not in stamps)
-                    hashed = sorted(n for n in numbers if len(np.unique(block[n][:1000])) > FEW)
-                rows = np.zeros(len(next(iter(block.values()))) if hashed else 0, np.uint64)
-                for name, cells in block.items():
-                    if start != following:
-                        columns[names[name]].leap()
-                    columns[names[name]].add(cells, start)
-                    digest.update(cells.tobytes())
-                for name in hashed:
-                    rows = rows * _PRIME ^ np.ascontiguousarray(block[name]).view(np.uint64)
-                head = np.append(head, rows[: _ENDS - len(head)])
-                tail = np.append(tail, rows)[-_ENDS:]
-                following = start + len(next(iter(block.values())))
-                numbered.append(np.arange(start, following))
+                    stamps = {name: [] for names_ in likely for name in names_}
+                    rows.begin(block, stamps)
+                rows.add(block)
+                if is_short:
+                    waiting = {names[name]: cells for name, cells in block.items()}
+                    self._pending.append((source, waiting, values, empty))
+                for name, cells in {} if is_short else block.items():
+                    if not start:
+                        facts[name].begin([source])
+                    elif start != numbered[-1][-1] + 1:
+                        facts[name].leap()
+                    facts[name].add(cells, start)
+                numbered.append(np.arange(start, start + len(next(iter(block.values())))))
                 for name in stamps:
                     stamps[name].append(block[name])
             for first, *more in likely:
-                columns_of = [np.concatenate(stamps[name]) for name in (first, *more)]
+                cells_of = [np.concatenate(stamps[name]) for name in (first, *more)]
                 with contextlib.suppress(TrajectoryError):
-                    if clock := ClockFacts.of(np.concatenate(numbered), columns_of):
+                    if clock := ClockFacts.of(np.concatenate(numbered), cells_of):
                         clocks[names[first]] = clock
                         added.update((names[first], names[name]) for name in more)
+            if not is_short and topic.rows:
+                self._keep(names.values(), [(values, empty)])
         self.ledger.merge(recording.ledger, source)
         self.recordings.append(
             RecordingFacts(
@@ -465,14 +491,48 @@ class Inspection:
                 clocks,
                 frozenset(f"{n}.{t.time}" if n else t.time for n, t in topics if t.time),
                 added,
-                {name: c.values - before[name] for name, c in columns.items() if c.values},
+                values,
                 dict(recording.fields),
-                frozenset(n for n, c in columns.items() if c.numbers.count == numbers_before[n]),
-                digest.hexdigest(),
-                head,
-                tail,
+                empty,
+                rows.digest.hexdigest(),
+                rows.head,
+                rows.tail,
             )
         )
+        if len(self._pending) >= _PENDING:
+            self._work_off()
+
+    def _work_off(self) -> None:
+        """Count the cells of short recordings that have waited, column by column."""
+        pending, self._pending = self._pending, []
+        for _, alike in itertools.groupby(pending, key=lambda waiting: [*waiting[1]]):
+            recordings = [*alike]
+            for name in recordings[0][1]:
+                # A text in one makes no texts of the others' numbers.
+                texts = [r for r in recordings if r[1][name].dtype.kind == "U"]
+                numbers = [r for r in recordings if r[1][name].dtype.kind != "U"]
+                for several in filter(None, (texts, numbers)):
+                    cells = [recording[1][name] for recording in several]
+                    firsts = np.cumsum([0, *map(len, cells[:-1])])
+                    self.columns[name].begin([recording[0] for recording in several], firsts)
+                    self.columns[name].add(np.concatenate(cells))
+                    self._keep([name], [recording[2:] for recording in several])
+
+    def _keep(
+        self,
+        names: Iterable[str],
+        recordings: Sequence[tuple[dict[str, Counter[float | str]], set[str]]],
+    ) -> None:
+        """Keep the values of columns in each of the last recordings, and which it lacks."""
+        for name in names:
+            facts = self.columns[name]
+            for (values, empty), recent, filled in zip(
+                recordings, facts.recent, facts.filled.tolist(), strict=True
+            ):
+                if facts.values is not None:
+                    values[name] = recent
+                if not filled:
+                    empty.add(name)
 
 
 def inspect_logs(
