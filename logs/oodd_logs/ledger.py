@@ -184,9 +184,16 @@ class Ledger:
         return [entry.line(total) for entry in self]
 
     def complete(self, other: Self) -> None:
-        """Add those entries of another ledger of which this one says nothing of the same thing."""
-        things = {_thing(entry) for entry in self}
-        self._entries |= {k: e for k, e in other._entries.items() if _thing(e) not in things}
+        """Add what another ledger has of things, or of their sources, and this one has not."""
+        things = {_thing(entry): entry for entry in self}
+        for key, entry in other._entries.items():
+            mine = things.get(_thing(entry))
+            if mine is None:
+                self._entries[key] = entry
+            elif entry.item != "column":
+                for source in entry.sources.keys() - mine.sources.keys():
+                    mine.count += entry.sources[source]
+                    mine.sources[source] = entry.sources[source]
 
     def summary(self, sensors: Sequence[str], total: int = 0) -> list[str]:
         """Return the sensors with the columns that were left out, and the other entries, in lines.
