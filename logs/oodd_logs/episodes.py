@@ -251,7 +251,7 @@ def read_episodes(recipe: Recipe, root: Path) -> EpisodeSource:
     TrajectoryError
         When a recording cannot be read; the message names file and row.
     """
-    reading = _Reading(recipe, IntervalList.of(recipe, root))
+    reading = _Reading(recipe, IntervalList.of(recipe, root), root=root)
     return _read(reading, _recordings(reading, _listed(reading, root)))
 
 
@@ -299,7 +299,7 @@ def _scan_goes_on(reading: "_Reading", label: str, item: Item = "recording") -> 
             raise
         del episodes[count:]
         reading.failures.append(error)
-        reason = str(error).replace(str(reading.root), "").strip("/")
+        reason = str(error).replace(f"{reading.root}/", "")
         reading.ledger.add(item, "dropped", reason.removeprefix(label).lstrip(",: "), source=label)
 
 
@@ -382,7 +382,7 @@ def matching_files(patterns: Sequence[str], root: Path) -> list[Path]:
 
 def _listed(reading: "_Reading", root: Path) -> Iterator[tuple[Path, frozenset[str]]]:
     """Yield the files of a recipe in natural order with their roles."""
-    recipe, reading.root = reading.recipe, root
+    recipe = reading.recipe
     tables = {
         FILES: recipe.nominal.files,
         TRAIN: recipe.nominal.train,
@@ -816,6 +816,8 @@ def _in_parts(reading: _Reading) -> EpisodeSource:
     """Return all episodes, in their parts, or in one in the order of stamps if these tell it."""
     recipe, selections = reading.recipe, reading.selections
     if reading.every:
+        for error in reading.intervals.unused(reading.names):
+            reading.ledger.add("mark", "dropped", str(error))
         source = _source(reading, reading.parts)
         if reading.by_stamps:
             source.parts[EVERY].sort(key=lambda facts: facts.begin)
@@ -825,7 +827,8 @@ def _in_parts(reading: _Reading) -> EpisodeSource:
         return source
     if reading.first is None:
         raise UsageError("there are no recordings to read, expected at least one")
-    reading.intervals.check_all_used(reading.names)
+    for error in reading.intervals.unused(reading.names):
+        raise error
     labelled = {text for selection in selections.values() for text in selection.labels}
     for text in (text for text in recipe.label_columns if text not in labelled):
         columns = {name for layout in selections for name in named_columns(layout)}
@@ -881,7 +884,7 @@ def _source(reading: _Reading, parts: dict[str, list[EpisodeFacts]]) -> EpisodeS
         rate,
         parts,
         ledger=reading.ledger,
-        recordings=reading.recordings,
+        recordings=reading.recordings + len(reading.failures),
     )
 
 

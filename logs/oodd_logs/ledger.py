@@ -186,7 +186,13 @@ class Ledger:
     def complete(self, other: Self) -> None:
         """Add what another ledger has of things, or of their sources, and this one has not."""
         things = {_thing(entry): entry for entry in self}
+        gone = {source for entry in self.of("file", "dropped") for source in entry.sources}
         for key, entry in other._entries.items():
+            if entry.item in {"file", "recording"} and entry.fate == "dropped":
+                entry.sources -= Counter(dict.fromkeys(gone, entry.count))
+                entry.count = entry.sources.total()
+            if not entry.count:
+                continue
             mine = things.get(_thing(entry))
             if mine is None:
                 self._entries[key] = entry

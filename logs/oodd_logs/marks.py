@@ -304,10 +304,10 @@ class IntervalList:
             )
         return [interval for key in names for interval in self._rows[key]]
 
-    def check_all_used(self, files: Iterable[str]) -> None:
-        """Raise `UnknownNameError` when an interval is of no recording that was read."""
-        for name in sorted(self._unused):
-            raise UnknownNameError(f"file of {self._source}", name, files)
+    def unused(self, files: Iterable[str]) -> list[UnknownNameError]:
+        """Return an error for each name that is of no recording that was read."""
+        names = sorted(self._unused)
+        return [UnknownNameError(f"file of {self._source}", name, files) for name in names]
 
 
 def read_intervals(path: Path) -> list[Interval]:

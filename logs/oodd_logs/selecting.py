@@ -136,7 +136,7 @@ def respellings(layout: Layout, recipe: Recipe, first: Layout | None) -> dict[tu
     def spelled(topic: str, text: str) -> str:
         """Return the one column that is spelled otherwise than a text; empty for none."""
         columns = spellings[topic, plain_name(text)]
-        units = {_plain(split_unit(name)[1]) for name in (text, *columns)} - {"", "1"}
+        units = {plain_unit(split_unit(name)[1]) for name in (text, *columns)} - {"", "1"}
         return columns[0] if len(columns) == 1 and len(units) < 2 else ""
 
     pairs = [(topic, name, spelled(topic, name)) for topic, name in expected - there]
@@ -186,7 +186,8 @@ def _renamed(topic: Topic, names: Mapping[str, str]) -> Topic:
     return Topic(tuple(names.values()), topic.rows, read, time)
 
 
-def _plain(unit: str) -> str:
+def plain_unit(unit: str) -> str:
+    """Return a unit without what spellings differ in: Unicode form and blanks."""
     return " ".join(unicodedata.normalize("NFKC", unit).split())
 
 

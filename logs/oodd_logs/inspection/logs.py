@@ -33,7 +33,7 @@ from oodd_logs.ledger import Ledger
 from oodd_logs.marks import says_nominal
 from oodd_logs.readers import NO_OPTIONS, Options, Reader, in_order, readers
 from oodd_logs.recording import Column, Recording, Topic
-from oodd_logs.selecting import plain_name, split_unit
+from oodd_logs.selecting import plain_name, plain_unit, split_unit
 from oodd_logs.splitting import split_recording
 
 _SHORT: Final = 512  # rows up to which recordings are counted together
@@ -369,7 +369,7 @@ class Inspection:
             if names[name] in self.columns:
                 continue
             known = self._spellings.setdefault((below, plain_name(name)), names[name])
-            units = {split_unit(known)[1], split_unit(name)[1]} - {""}
+            units = {plain_unit(split_unit(text)[1]) for text in (known, name)} - {""}
             if known not in whole and len(units) < 2:
                 self._written.setdefault(known, {}).setdefault(names[name], []).append(source)
                 names[name] = known

@@ -136,7 +136,9 @@ def table_of(episodes: Sequence[ScannedEpisode]) -> tuple[list[str], list[list[s
         [
             scanned.episode.name,
             "" if scanned.first is None else str(scanned.first),
-            "" if (time := scanned.as_json()["first_odd_time"]) is None else f"{round(time, 3):.13g}",
+            ""
+            if (time := scanned.as_json()["first_odd_time"]) is None
+            else f"{round(time, 3):.13g}",
             p_value(scanned.p),
             p_value(scanned.q),
             ", ".join(scanned.suspects[:SENSORS]),
