@@ -24,7 +24,7 @@ from oodd_eval.data.facts import (
 )
 from oodd_eval.errors import UnknownNameError, UsageError
 from oodd_eval.names import check_known
-from oodd_logs.kinds import kinds_by_key
+from oodd_logs.kinds import kinds_by_key, missing_codes
 
 FAILURE: Final = "failure"
 """Kind of the episodes that failed, where a recipe names no other."""
@@ -454,6 +454,8 @@ class Recipe:
             raise UsageError(f"{source} lacks the key 'split', the name of the split to make")
         options = dict(values.pop("read", {}))
         values["columns"] = {key: values.pop(key) for key in kinds_by_key() if key in values}
+        if codes := values["columns"].get(missing_codes.KEY):
+            options[missing_codes.KEY] = codes
         files = {"format": _text("[read]: format", options.pop("format", "")), "options": options}
         recipe = cls(**{"environment": values["split"]} | values | files)
         recipe.check(source)

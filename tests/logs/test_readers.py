@@ -414,6 +414,31 @@ def test_an_object_a_line_may_be_a_row_or_hold_matrices(tmp_path):
     assert recording.fields == {"ok": True}
 
 
+@pytest.mark.parametrize(
+    ("row", "names"),
+    [
+        ({"t": 0, "status": [{"name": "arm", "level": 1}]}, ("t", "status.arm.level")),
+        ({"hits": [{"name": "a", "x": 1}, {"name": "b", "x": 2}]}, ("hits.a.x", "hits.b.x")),
+        ({"header": {"stamp": {"sec": 1, "nanosec": 0}}, "cov": [[1, 2], [3, 4]]},
+         ("header.stamp", "cov.0.0", "cov.0.1", "cov.1.0", "cov.1.1")),
+    ],
+)  # fmt: skip
+def test_an_object_with_a_stamp_or_named_parts_is_a_row(tmp_path, row, names):
+    topic = table("jsonl", written(tmp_path, f"{json.dumps(row)}\n" * 3, "run.jsonl"))
+    assert (topic.names, topic.rows) == (names, 3)
+
+
+@pytest.mark.parametrize(
+    ("end", "said"),
+    [(b'{"t": 2, "x', "line 3 is cut"), (b"\0\0\0", "zero bytes"), (b'{"t": 2\0\0\n', "line 3")],
+)
+def test_lines_of_json_that_a_logger_cut_are_said(tmp_path, end, said):
+    (tmp_path / "run.jsonl").write_bytes(b'{"t": 0, "x": 5}\n{"t": 1, "x": 6}\n' + end)
+    (recording,) = recordings("jsonl", tmp_path / "run.jsonl")
+    assert rows(recording.topics[""]) == {"t": [0, 1], "x": [5, 6]}
+    assert said in "\n".join(recording.ledger.lines())
+
+
 # Parquet and LeRobot.
 
 

@@ -17,7 +17,6 @@ from oodd_logs.readers.packed import open_bytes, read_text, stem
 from oodd_logs.recording import Recording, Topic
 
 _DEEPEST: Final = 3  # levels below which no table is looked for
-_CLOCKS: Final = {"t", "time", "times", "timestamp", "timestamps", "stamp", "stamps", "step"}
 
 
 def _open(path: Path, options: Options) -> Iterator[Recording]:
@@ -137,7 +136,7 @@ def _are_rows(values: list[Any]) -> bool:
     lists = {key: v for key, v in values[0].items() if isinstance(v, list) and len(v) > 1}
     longest = max(map(len, lists.values()), default=0)
     has_steps = any(isinstance(v[0], dict) for v in lists.values())
-    return not (has_steps or longest > len(values) or {key.lower() for key in lists} & _CLOCKS)
+    return not (has_steps or longest > len(values) or {key.lower() for key in lists} & jsonl.CLOCKS)
 
 
 def _fields(
