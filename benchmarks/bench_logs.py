@@ -1,6 +1,6 @@
 """What it takes to read and to import logs: processor seconds beside a plain loop, and peak memory.
 
-``python benchmarks/bench_logs.py [--files 1000] [--rows 10000000]``
+``python benchmarks/bench_logs.py [--files 1000] [--rows 10000000] [--json 15]``
 
 The limit is a plain loop over the rows of `csv.reader` with `float` for every cell, which was the
 whole reader before there were recipes. It and the reader of CSV files take turns, file by file, in
@@ -8,12 +8,15 @@ one process; files are links to 20 different ones. An import runs in a process o
 peak of memory is measured. The import before there were recipes took 1.8 times the seconds of the
 plain loop over its files (200 of them, measured in turns), which is the limit of today's; of few
 files, most is the start of the program. A recording of 10^7 rows and 20 columns in one Parquet file
-is read in windows, and imported. Exit code 1 where a ratio is above its limit, or memory above
-500 MB for the files, 1 GB for the recording.
+is read in windows, and imported. Lines of JSON, of one recording and of episodes of ten steps, are
+inspected; the limit is `json.loads` of every line. Exit code 1 where a ratio is above its limit, or
+memory above 500 MB for the files, 1 GB for the recording.
 """
 
 import argparse
 import csv
+import itertools
+import json
 import os
 import resource
 import subprocess
@@ -30,12 +33,20 @@ from oodd_logs.readers import readers
 DIFFERENT, ROWS, COLUMNS = 20, 5000, 8
 WIDE, WINDOW = 20, 600
 READING, IMPORTING = 1.0, 1.8  # of the plain loop's seconds
+INSPECTING = 15.0  # of the seconds of json.loads
 FILES_MB, RECORDING_MB = 500, 1000
 
 IMPORT = """
 import sys
 from oodd_eval.cli.main import main
 assert main(sys.argv[1:]) == 0
+"""
+INSPECT = """
+import sys
+from oodd_eval.cli.main import main
+sys.stdout = open("/dev/null", "w")
+assert main(["data", "inspect", sys.argv[1]]) == 0
+sys.stdout = sys.__stdout__
 """
 READ = """
 import sys
@@ -77,6 +88,29 @@ def write_recording(path, rows):
             noise = rng.normal(size=(WIDE, count)).round(2).astype("f4")
             columns = [np.arange(start, start + count) / 100, *noise]
             writer.write_table(pa.table(columns, schema=schema))
+
+
+def write_json(path, megabytes, steps):
+    """Write lines of JSON: rows with a stamp, a pose and 20 numbers, or episodes of some steps."""
+    rng = np.random.default_rng(0)
+    with path.open("w") as file:
+        for i in itertools.count():
+            if file.tell() > megabytes * 10**6:
+                break
+            if steps:
+                values = rng.normal(size=(steps, 30)).round(4).tolist()
+                row = {"task": i % 5, "steps": [{"t": t, "q": q} for t, q in enumerate(values)]}
+            else:
+                row = {"header": {"stamp": {"nanosec": 0, "sec": i}, "frame_id": "base"}}
+                row["pose"] = {"x": i / 7, "q": [0.1, 0.2, 0.3, i % 5]}
+                row |= {f"s{k}": x for k, x in enumerate(rng.normal(size=20).round(5).tolist())}
+            file.write(json.dumps(row) + "\n")
+
+
+def load_json(path):
+    """Read every line of JSON and keep nothing."""
+    with path.open() as file:
+        return sum(len(json.loads(line)) for line in file)
 
 
 def plain(path):
@@ -137,6 +171,22 @@ def imported(folder, name, form, more=""):
     return child(IMPORT, "data", "import", str(file), "--output", str(output))
 
 
+def measure_json(folder, megabytes):
+    """Print what inspecting lines of JSON takes; return what is beyond its limit."""
+    beyond = []
+    for what, steps in (("rows", 0), ("episodes of 10 steps", 10)):
+        path = folder / f"{steps}.jsonl"
+        write_json(path, megabytes, steps)
+        loading, _ = timed(load_json, path)
+        taken, memory = child(INSPECT, str(path))
+        ratio = taken / loading
+        figures = f"{taken:.1f} s, {ratio:.1f} of json.loads; peak {memory:.0f} MB"
+        print(f"inspecting {megabytes} MB of JSON, {what}: {figures}")
+        if ratio > INSPECTING:
+            beyond.append(f"inspection of JSON, {what}")
+    return beyond
+
+
 def measure(folder, files, rows):
     """Print all figures; return what is beyond its limit."""
     beyond = []
@@ -173,9 +223,11 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--files", type=int, default=1000)
     parser.add_argument("--rows", type=int, default=10**7)
+    parser.add_argument("--json", type=int, default=15, help="megabytes")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        beyond = measure(Path(folder), options.files, options.rows)
+        beyond = measure_json(Path(folder), options.json)
+        beyond += measure(Path(folder), options.files, options.rows)
     for what in beyond:
         print(f"beyond its limit: {what}")
     return int(bool(beyond))
