@@ -273,12 +273,7 @@ def _next_steps(
     yield f"Next, look at {first.episode.name}{at}: {first.reason}.", link
     if options.rerun:
         yield "Rerun opens a tab for each of the first:", shlex.join(["rerun", str(options.rerun)])
-    unsure = [s.episode.name for s in suspicious if not s.odd] or [first.episode.name]
-    names = shlex.quote(",".join(unsure[:3]))
-    yield (
-        "Say which are fine; from 20 on they make the ranks of the others exact:",
-        f"--fine {names}",
-    )
+    yield "Say which are fine; from 20 on they make the ranks of the others exact:", "--fine NAMES"
     if drop and logs.form == "lerobot":
         indices = shlex.quote(json.dumps(_numbers(drop)))
         root = f"--root {shlex.quote(str(options.logs))} --repo_id NAME --new_repo_id NEW"
