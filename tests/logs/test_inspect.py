@@ -235,6 +235,10 @@ def test_labels_are_often_nominal_and_texts_name_their_nominal_value(tmp_path):
     assert draft_recipe(tmp_path).nominal_label == (1,)
     # One file with both kinds of rows stands below both.
     assert recipe.nominal.files == recipe.anomalous["fault"].files == ("a.csv",)
+    for i in range(4):
+        write(tmp_path / f"r{i:02}.csv", process(200, i) | {"health": [0] * 150 + [i // 3] * 50})
+    (tmp_path / "a.csv").unlink()
+    assert [*draft_recipe(tmp_path).anomalous] == ["fault"]  # the number of a file is no kind
 
 
 @pytest.mark.parametrize(
@@ -242,6 +246,7 @@ def test_labels_are_often_nominal_and_texts_name_their_nominal_value(tmp_path):
     [
         (["nominal/run-0", "nominal/run-1", "Slip 1/run-0"], "nominal/*.csv", "slip-1",
          "Slip 1/run-0.csv"),
+        (["free_1", "free_2", "valve1_1"], "free*.csv", "valve1", "valve1_1.csv"),
         (["flight_1_no_failure", "flight_2_engine_failure", "flight_3_no_failure"],
          "flight*no_failure.csv", "engine", "flight_2_engine_failure.csv"),
     ],

@@ -94,13 +94,17 @@ def _by_kind(files: Sequence[str], anomalous: Sequence[str], reason: str) -> Sor
     texts = {file: str(Path(file).with_suffix("")).lower() for file in files}
     parts = {file: re.split(r"[\s_.,/\-]+", text) for file, text in texts.items()}
     shared = set.intersection(*map(set, parts.values()))
+    # The number of a log, as in r12, where nominal ones are numbered likewise, is no anomaly.
+    nominal = tuple(file for file in files if file not in {*anomalous})
+    stems = {word: re.sub(r"\d+", "", word) for words in parts.values() for word in words}
+    numbered = {"", *(stems[word] for file in nominal for word in parts[file])}
     kinds: dict[str, list[str]] = defaultdict(list)
     for file in anomalous:
         folder = Path(file).parent.name
-        words = [w for w in parts[file] if not w.isdigit() and w not in shared]
+        words = [w for w in parts[file] if w not in shared]
+        words = [w for w in words if w == stems[w] or stems[w] not in numbered]
         name = folder if folder and len({Path(f).parent for f in files}) > 1 else "-".join(words)
         kinds[name_of(name, "fault", ANOMALIES)].append(file)
-    nominal = tuple(file for file in files if file not in {*anomalous})
     return Sorting(nominal, {kind: tuple(names) for kind, names in kinds.items()}, reason)
 
 
