@@ -16,7 +16,6 @@ licence = "CC BY 4.0"
 citation = "Doe 2024"
 time = "t[ms]"
 dates = "day first"
-episode = "run"
 rate = 100
 gap = 2.5
 episode = ["robot", "run"]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oodd_logs.inspection.columns import parse_dates
-from oodd_logs.kinds.times import pairs_of
+from oodd_logs.kinds.times import names_time, pairs_of
 from oodd_logs.recording import Column, Recording, Topic
 from oodd_logs.splitting import BEGINS, COUNTS, ENDS, last_part
 
@@ -28,10 +28,7 @@ _EPISODE: Final = re.compile(
 _NO_KEY: Final = re.compile(
     r"anomal|fault|fail|label|health|attack|alarm|error|class|status|phase|stage|state|mode|signal"
     r"|variable|channel|topic|metric|tag$|parameter|sensor|flag"
-)
-_OF_TIME: Final = re.compile(
-    r"(?:^|[^a-z])(?:[num]?s|[num]?secs?|(?:nano|micro|milli)?seconds?|nanos?|micros?|millis?|minutes?"
-    r"|hours?|days?|dates?|months?|years?|time|stamp|epoch)(?:$|[^a-z])"
+    r"|month|year|week|dates$"
 )
 _WRITER: Final = re.compile(
     r"(?:^|[^a-z])(?:robot|vehicle|machine|device|agent|drone|rover|car|truck|turbine|engine|unit|env"
@@ -100,8 +97,7 @@ def _keys(topic: Topic, sample: Mapping[str, Column], restarts: Mapping[str, _Ma
         changes = column[1:] != column[:-1]
         episodes = int(changes.sum()) + 1
         # Whole seconds rise where fractions start anew, and so do days.
-        other = _NO_KEY.search(_words(name)) or _OF_TIME.search(_words(name))
-        is_key = name not in restarts and not other
+        is_key = name not in restarts and not _NO_KEY.search(_words(name)) and not names_time(name)
         if not is_key or not 1 < episodes <= len(column) / _SHORTEST:
             continue
         explains = any(np.array_equal(falls, changes[: len(falls)]) for falls in restarts.values())
