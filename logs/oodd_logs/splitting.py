@@ -109,7 +109,8 @@ def split_recording(
     UsageError
         When the columns tell no episodes apart, or another topic cannot be cut.
     """
-    if {*columns} <= {*recording.fields}:  # none, or the format has told them apart
+    rows = max((topic.rows for topic in recording.topics.values()), default=0)
+    if not rows or {*columns} <= {*recording.fields}:  # the format may have told them apart
         yield recording
         return
     layout = layout_of(recording)
@@ -132,10 +133,11 @@ def split_recording(
     ledger.merge(recording.ledger)
     runs = {column.column: _Runs.of(marked, column.column) for (column,) in matches.values()}
     episodes = _episodes(recording.source, runs, ledger)
-    rows = {main: [episode.rows for episode in episodes]} | _by_stamps(recording, main, episodes)
+    parts = {main: [episode.rows for episode in episodes]}
+    parts |= _by_stamps(recording, main, episodes, ledger)
     names = tuple(n for n in marked.names if n not in runs or runs[n].kind == "counter")
     topics = {**recording.topics, main: dataclasses.replace(marked, names=names)}
-    topics = {name: _held(topic, rows[name]) for name, topic in topics.items()}
+    topics = {name: _held(topic, parts[name]) for name, topic in topics.items()}
     for i, episode in enumerate(episodes):
         ended = [bool(v) for name, v in episode.fields.items() if last_part(name) in TERMINAL]
         terminated = {"terminated": any(ended)} if ended else {}
@@ -143,7 +145,7 @@ def split_recording(
             recording,
             name=f"{recording.name}-{episode.name}",
             source=f"{recording.source}, {episode.title}",
-            topics={name: _slice(topic, rows[name][i]) for name, topic in topics.items()},
+            topics={name: _slice(topic, parts[name][i]) for name, topic in topics.items()},
             fields={**recording.fields, **episode.fields, **terminated},
             ledger=Ledger() if i else ledger,
         )
@@ -266,16 +268,11 @@ def _by_key(
     total = next(iter(keys.values())).rows
     starts = functools.reduce(np.union1d, [r.starts for r in keys.values()])
     lengths = np.diff(np.append(starts, total))
-    values, codes = [], []
+    group, lacks = np.zeros(len(starts), np.int64), np.zeros(len(starts), bool)
     for r in keys.values():
-        distinct, code = np.unique(r.at(starts), return_inverse=True)
-        values.append(distinct.tolist())
-        codes.append(np.append(code, -1)[:-1])
-    lacks = np.zeros(len(starts), bool)
-    for distinct, code in zip(values, codes, strict=True):
-        lacks |= np.isin(code, [i for i, v in enumerate(distinct) if _is_missing(v)])
-    combinations, group = np.unique(np.stack(codes), axis=1, return_inverse=True)
-    group = group.reshape(-1)
+        values, codes = np.unique(r.at(starts), return_inverse=True)
+        lacks |= np.array([*map(_is_missing, values.tolist())], bool)[codes]
+        group = group * len(values) + codes
     # A cell that is missing within an episode is of this episode.
     there = np.flatnonzero(~lacks)
     before = np.searchsorted(there, np.arange(len(starts)), side="right") - 1
@@ -292,20 +289,14 @@ def _by_key(
     kept = np.flatnonzero(~lacks)
     order = kept[np.argsort(group[kept], kind="stable")]
     for block in np.split(order, np.flatnonzero(np.diff(group[order])) + 1) if len(order) else ():
-        combination = combinations[:, group[block[0]]]
-        cells = [v[code] for v, code in zip(values, combination.tolist(), strict=True)]
-        yield (
-            dict(zip(keys, map(_whole, cells), strict=True)),
-            _spread(starts[block], lengths[block]),
-        )
+        cells = {name: r.at(starts[block[:1]]) for name, r in keys.items()}
+        whole = {name for name, cell in cells.items() if cell.dtype.kind == "f" and not cell % 1}
+        fields = {n: int(cell[0]) if n in whole else cell.item() for n, cell in cells.items()}
+        yield fields, _spread(starts[block], lengths[block])
 
 
 def _is_missing(value: Any) -> bool:
     return str(value).strip().lower() in _NO_VALUE
-
-
-def _whole(value: Any) -> Any:
-    return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 def _spread(starts: _Rows, lengths: _Rows) -> _Rows:
@@ -315,7 +306,7 @@ def _spread(starts: _Rows, lengths: _Rows) -> _Rows:
 
 
 def _by_stamps(
-    recording: Recording, main: str, episodes: Sequence[_Part]
+    recording: Recording, main: str, episodes: Sequence[_Part], ledger: Ledger
 ) -> dict[str, list[_Rows]]:
     """Return the rows of each episode in the other topics: from its first stamp to the next one."""
     others = {name: topic for name, topic in recording.topics.items() if name != main}
@@ -329,14 +320,16 @@ def _by_stamps(
             f"{recording.source}: other topics are cut by the stamps of {main!r}, but {problem}: "
             "read topics one by one ([read] topics)"
         )
-    stamps = {name: _column(topic, topic.time) for name, topic in recording.topics.items()}
+    stamps = {
+        name: np.concatenate([cells for _, cells in read_column(topic, topic.time)])
+        for name, topic in recording.topics.items()
+    }
     begins = stamps[main][[first for first, _ in spans]]
     cuts = {n: np.append(np.searchsorted(stamps[n], begins), len(stamps[n])) for n in others}
+    for name, rows in cuts.items():
+        reason, source = "before the first episode", recording.source
+        ledger.add("row", "dropped", reason, name=name, count=int(rows[0]), source=source, row=0)
     return {n: [*map(np.arange, rows[:-1], rows[1:])] for n, rows in cuts.items()}
-
-
-def _column(topic: Topic, name: str) -> Column:
-    return np.concatenate([cells for _, cells in read_column(topic, name)])
 
 
 def _held(topic: Topic, episodes: Sequence[_Rows]) -> Topic:

@@ -64,8 +64,10 @@ def episodes(*names, **columns):
         (["t"], {"t": [.0, .1, NAN, .3, .0, .1]}, [("0", {}, [0, 1, 2, 3]), ("1", {}, [4, 5])]),
         (["run"], {"run": [NAN, 1, NAN, 1, NAN, 2, 2]},
          [("1", {"run": 1}, [1, 2, 3]), ("2", {"run": 2}, [5, 6])]),
-        (["run"], {"run": ["u", "", "u", "v", "v"]},
-         [("u", {"run": "u"}, [0, 1, 2]), ("v", {"run": "v"}, [3, 4])]),
+        (["run"], {"run": ["1.0", "", "1.0", "v", "v"]},
+         [("1.0", {"run": "1.0"}, [0, 1, 2]), ("v", {"run": "v"}, [3, 4])]),
+        (["run"], {"run": [0.5, 0.5, 1, 1]},
+         [("0.5", {"run": 0.5}, [0, 1]), ("1", {"run": 1}, [2, 3])]),
     ],
 )  # fmt: skip
 def test_keys_flags_and_counters_tell_episodes_apart(names, columns, expected):
@@ -93,6 +95,8 @@ def test_columns_that_tell_no_episodes_apart_are_refused():
     (whole,) = split_recording(table, ["runn"], lenient=True)
     assert "no column 'runn', and counts as one episode" in "\n".join(whole.ledger.lines())
     assert [*split_recording(table, [])] == [table]
+    empty = recording(run=ROWS[:0])
+    assert [*split_recording(empty, ["run"])] == [empty]  # whoever reads its rows says so
     told_apart = Recording("all", "all.csv", table.topics, {"run": 3})
     assert [*split_recording(told_apart, ["run"])] == [told_apart]
 
@@ -126,6 +130,7 @@ def test_other_topics_are_cut_by_their_stamps():
     parts = [*split_recording(bag, ["/trial.trial"])]
     x = [part.topics["/imu"].read(["x"], 0, part.topics["/imu"].rows)["x"] for part in parts]
     assert [values.tolist() for values in x] == [[1, 2, 3, 4], [5, 6]]
+    assert "1 row of /imu, before the first episode" in "\n".join(parts[0].ledger.lines())
     unstamped = Recording("bag", "bag", {"/trial": marker, "/imu": Topic.of({"x": stamps})})
     with pytest.raises(UsageError, match="not all topics have stamps"):
         [*split_recording(unstamped, ["/trial.trial"])]
