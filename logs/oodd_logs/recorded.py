@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from oodd_eval.data.parts import CALIBRATION, TRAIN, TWINS
 from oodd_eval.errors import TrajectoryError, UnknownNameError, UsageError
-from oodd_logs.kinds.times import orders_of, parse_times, unit_in
+from oodd_logs.kinds.times import orders_of, parse_times, past_midnight, unit_in
 from oodd_logs.ledger import Fate, Item, Ledger
 from oodd_logs.marks import IntervalList, LabelValues, Mark, anomalous_cells, runs_of
 from oodd_logs.readers.cells import mixed
@@ -187,7 +187,8 @@ class StampedRows:
             lacking = np.flatnonzero(~np.isfinite(times))
             cell = str(cells[lacking[0]]) if len(lacking) and cells.dtype.kind == "U" else ""
             self._say("dropped", "without a stamp", lacking, cell, column.column)
-            stamps += times
+            is_clock = cells.dtype.kind == "U" and len(self._selection.times[topic]) == 1
+            stamps += past_midnight(times) if is_clock else times
         missing = ~np.isfinite(stamps)
         if missing.any() and is_strict:
             raise TrajectoryError(

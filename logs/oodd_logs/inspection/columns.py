@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from oodd_eval.data.offsets import RunningMoments, is_coarse
 from oodd_eval.errors import TrajectoryError
-from oodd_logs.kinds.times import SCALES, orders_of, parse_times, unit_in
+from oodd_logs.kinds.times import SCALES, orders_of, parse_times, past_midnight, unit_in
 from oodd_logs.ledger import Fate
 from oodd_logs.marks import runs_of
 from oodd_logs.readers.cells import mixed
@@ -39,6 +39,7 @@ EXCEPTIONS: Final[Mapping[str, Fate]] = {TEXT: "held", _INFINITE: "held", _BEYON
 _WHOLE: Final = np.zeros(1, np.int64)  # cells of one recording
 _FAR: Final = 1e6  # median deviations
 _JUMP: Final = 0.45  # share of the range, from which a step may be back to the beginning
+_ROUNDED: Final = 1e-4  # share by which the mean step of stamps differs from the median
 _NEAR: Final = 0.001  # share by which a period is rounded
 
 
@@ -409,12 +410,19 @@ class ClockFacts:
                 parse_times(cells, of_column, order)
                 for cells, of_column in zip(columns, units, strict=False)
             ]
-            times = np.sum(seconds, axis=0)
+            times = past_midnight(seconds[0]) if dated else seconds[0]
+            if len(columns) > 1:
+                times = seconds[0] + seconds[1]
             present = np.isfinite(times)
             times = times[present]
             if len(times) < 2:
                 return None
             steps, whole = Steps.of(times, rows[present]), bool((times == np.round(times)).all())
+            # Of stamps that were rounded the mean step tells the rate, not the median.
+            apart = np.diff(times)
+            even = apart[np.abs(apart - steps.usual) < steps.usual / 4]
+            if len(even) and abs(even.mean() / steps.usual - 1) > _ROUNDED:
+                steps = replace(steps, usual=float(even.mean()))
             readings[order] = cls(steps, unit, float(np.abs(times).max()), whole)
         return replace(readings[orders[0]], by_order=readings) if orders else readings[""]
 

@@ -223,18 +223,39 @@ class Inspection:
     def times(self) -> dict[str, str]:
         """Columns with the times of rows, one a topic, and their units.
 
-        Of those that may be, the one that falls least; none where a hundredth of its steps fall.
+        Of those that may be, the one that falls and stands still least in the median of the
+        recordings; none where a hundredth of its steps do.
         """
         time_columns: dict[str, str] = {}
         best: dict[str, float] = {}
-        for name in dict.fromkeys(c for r in self.recordings for c in r.clocks):
+        for name, (falls, repeats) in self._stuck.items():
             topic, facts = self.topic_of(name), self.columns[name]
-            stuck = sum(c.steps.falls + c.steps.repeats for _, c in self.clocks(name))
-            share = stuck / max(1, facts.cells)
+            share = falls + repeats
             if share < min(0.01, best.get(topic, 1.0)) and facts.missing < facts.cells / 2:
                 time_columns[topic], best[topic] = name, share
         clocks = {name: [clock for _, clock in self.clocks(name)] for name in time_columns.values()}
         return {n: "s" if n in self.stamps else time_unit(n, c) for n, c in clocks.items()}
+
+    @cached_property
+    def _stuck(self) -> dict[str, tuple[float, float]]:
+        """Shares of steps that fall, and that are none, in the median recording, of likely times.
+
+        They are likely where half of the recordings with their topic have them.
+        """
+        shares: dict[str, list[tuple[float, float]]] = defaultdict(list)
+        topics = Counter(topic for recording in self.recordings for topic in recording.rows)
+        for recording in self.recordings:
+            for name, clock in recording.clocks.items():
+                rows = max(1, recording.rows[self.topic_of(name)])
+                shares[name].append((clock.steps.falls / rows, clock.steps.repeats / rows))
+        most = {name: 2 * len(s) >= topics[self.topic_of(name)] for name, s in shares.items()}
+        return {name: tuple(np.median(shares[name], axis=0)) for name in shares if most[name]}
+
+    @cached_property
+    def standing(self) -> set[str]:
+        """Columns with stamps that rise, but stand still too often for times of rows."""
+        others = {n: s for n, s in self._stuck.items() if n not in self.times}
+        return {n for n, (falls, repeats) in others.items() if falls < 0.01 <= repeats}
 
     @cached_property
     def added(self) -> dict[str, str]:
@@ -315,6 +336,7 @@ class Inspection:
             roles = (
                 ("times", name in times),
                 ("labels", name in labels),
+                ("standing", name in self.standing),
                 ("empty", facts.empty),
                 ("text", facts.text),
                 ("", name in together),
@@ -411,8 +433,14 @@ class Inspection:
                         "cell", EXCEPTIONS[reason], reason, name=name, cell=cell, **values
                     )
         for recording in (r for r in self.recordings if r.file not in self.usable):
-            if lacking := self._lacking(recording):
-                reason = f"it lacks {listed(sorted(lacking))}"
+            for name in sorted(self._lacking(recording) & recording.empty):
+                where = recording.file
+                self.ledger.add("column", "kept", "no number in it", name=name, source=where)
+            if lacking := self._lacking(recording) - recording.empty:
+                units = {plain_name(name): name for name in recording.columns}
+                instead = {name: units.get(plain_name(name), "") for name in sorted(lacking)}
+                lacks = [f"{n} (it has {other})" if other else n for n, other in instead.items()]
+                reason = f"it lacks {listed(lacks)}"
                 self.ledger.add("file", "dropped", reason, source=recording.file)
         for name, role in self.roles.items():
             if role and role not in {"times", "labels"}:

@@ -168,8 +168,9 @@ def rate_of(logs: Inspection) -> str:
         steps = [clock.steps.usual * SCALES[unit] for _, clock in logs.clocks(name)]
     steps = [step for step in steps if step > 0]
     step = max((s for s in steps if s * SLOW <= min(steps)), default=1.0)
-    is_round = abs(float(f"{step:.4g}") - step) < 1e-9 * step  # a row every 60 s, say
-    return f"{1 / step:.10g}" if is_round else f"{1 / step:.4g}"
+    text = f"{1 / step:.4g}"
+    is_round = abs(float(f"{step:.4g}") / step - 1) < 1e-6  # a row every 60 s, say
+    return text if abs(float(text) * step - 1) < 1e-6 or not is_round else f"{1 / step:.10g}"
 
 
 def gap_of(logs: Inspection) -> float:

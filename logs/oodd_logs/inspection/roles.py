@@ -33,6 +33,11 @@ class Role(NamedTuple):
 ROLES: Final[Mapping[str, Role]] = {
     "times": Role("a time", "time ({unit})"),
     "labels": Role("a label", "label? {values}"),
+    "standing": Role(
+        "stamps that often stand still",
+        "time that stands still",
+        "{names}: stamps that often stand still are no times of rows: rows count as equally spaced",
+    ),
     "empty": Role("no value in any row", "empty", "{names}: no value in any row; leave out"),
     "text": Role(
         "text", "text: {values}", "{names}: text is no sensor; it may be labels, kinds or task"

@@ -50,6 +50,7 @@ _MONTHS: Final = (
     "dec dez",
 )  # fmt: skip
 _MONTH_OF: Final = {name: i for i, names in enumerate(_MONTHS, 1) for name in names.split()}
+_DAY: Final = 86400.0
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 _TEXT: Final = re.compile(
     r"(?:(?:(?P<first>\d{1,4})[-/. ](?P<second>\d{1,2}|[^\W\d]{3,9})[-/. ]+(?P<third>\d{2,4})"
@@ -182,6 +183,21 @@ def parse_times(column: Column, unit: str = "", order: str = "") -> NDArray[np.f
     if not (dated | missing).all():
         return _one_by_one(cells.tolist(), missing, order)
     return np.where(missing, np.nan, stamps.astype(np.int64) / 1e9 - offsets)
+
+
+def past_midnight(times: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return times of day that go on where a day ends; other times come back as they are.
+
+    >>> past_midnight(np.array([86399.0, 0.0, 1.0]))
+    array([86399., 86400., 86401.])
+    """
+    present = np.isfinite(times)
+    clock = times[present]
+    if not len(clock) or clock.min() < 0 or clock.max() >= _DAY:
+        return times
+    risen = times.copy()
+    risen[present] += _DAY * np.cumsum(np.diff(clock, prepend=clock[0]) < -_DAY / 2)
+    return risen
 
 
 def orders_of(*columns: Column) -> tuple[str, ...]:
