@@ -1,16 +1,21 @@
 """One thing of thirty logs is spoilt: the result is that of the clean logs, or it is said which."""
 
+import dataclasses
+import functools
 import json
 import unicodedata
 from dataclasses import dataclass, field
 
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from oodd_logs.episodes import read_episodes
+from oodd_logs.importing import import_frames
 from oodd_logs.recipe import Recipe
 from oodd_logs.scanning.logs import read_logs
+from oodd_logs.scanning.scan import scan_episodes
 
 from oodd_eval.errors import OoddError
 
@@ -94,7 +99,7 @@ def cell(rng, log):
     value, name = values[rng.integers(len(values))], _column(rng)
     row = int(rng.integers(ROWS))
     log.columns[name][row] = value
-    log.thing += [name, f"row {row}"]
+    log.thing += [name, f"row {row}", f"rows {row}"]
 
 
 def several_cells(rng, log):
@@ -119,18 +124,18 @@ def _rename(log, old, new):
 
 def spelling(rng, log):
     name = _column(rng)
+    bare, bracket, unit_of_it = name.partition("[")
     spellings = (
-        name.swapcase(),
-        name.upper(),
-        unicodedata.normalize("NFD", name),
-        f" {name} ",
-        name.replace("[", " ["),
-        name.replace("[", "\N{NO-BREAK SPACE}["),
-        "\N{ZERO WIDTH SPACE}" + name,
-        name[0] + "\N{ZERO WIDTH SPACE}" + name[1:],
-        name.translate({ord(c): ord(c) + 0xFEE0 for c in "abcdefghijklmnopqrstuvwxyz"}),
+        bare.swapcase(),
+        bare.upper(),
+        unicodedata.normalize("NFD", bare),
+        f" {bare} ",
+        f"{bare}\N{NO-BREAK SPACE}",
+        "\N{ZERO WIDTH SPACE}" + bare,
+        f"{bare[0]}\N{ZERO WIDTH SPACE}{bare[1:]}",
+        bare.translate({ord(c): ord(c) + 0xFEE0 for c in "abcdefghijklmnopqrstuvwxyz"}),
     )
-    _rename(log, name, spellings[rng.integers(len(spellings))])
+    _rename(log, name, spellings[rng.integers(len(spellings))] + bracket + unit_of_it)
 
 
 def unit(rng, log):
@@ -320,6 +325,121 @@ def test_what_is_spoilt_changes_nothing_or_is_said(form, entrance, seed, clean):
         result, told = None, str(error)
     finally:
         path.write_bytes(before)
+    assert result or spoil is not spelling, (log.thing, told)
     if result is None or not equal(result, results[entrance]):
+        assert spoil is not spelling, (log.thing, told)
         assert path.stem in told, (spoil.__name__, log.thing, told)
         assert any(word in told for word in log.thing), (spoil.__name__, log.thing, told)
+
+
+@pytest.mark.parametrize(
+    ("row", "words"),
+    [
+        (("r25.csv", 7203.0, 7206.0, ""), ("r25.csv", "7203", "first stamp is 0.0", "last 5.9")),
+        (("r25.csv", 600, 700, ""), ("r25.csv", "row 600", "60 rows")),
+        (("r52.csv", 3.0, 6.0, ""), ("r52.csv",)),
+    ],
+)
+def test_intervals_that_mark_nothing_are_refused_and_a_scan_says_them(row, words, clean):
+    folder, _ = clean["csv"]
+    marked = [(f"r{i}.csv", 3.0, 6.0, "") for i in FAULTY]
+    recipe = dataclasses.replace(RECIPE, labels=(), intervals=(*marked, row))
+    with pytest.raises(OoddError) as raised, read_episodes(recipe, folder):
+        pass
+    read = read_logs(folder, recipe)
+    for told in (str(raised.value), "\n".join(read.notes)):
+        assert all(word in told for word in words)
+    assert len(read.episodes) == 2 * FILES
+
+
+# In memory
+
+
+def _strict(cells):
+    """Cells of one type: texts where one is text."""
+    is_text = any(isinstance(cell, str) for cell in cells)
+    return [None if c is None else str(c) for c in cells] if is_text else cells
+
+
+def _polars():
+    return pytest.importorskip("polars")
+
+
+def _masked(columns):
+    """An array of numbers, masked where one is missing, with a broken number below the mask."""
+    cells = np.array([*columns.values()], object).T
+    mask = np.array([[cell is None for cell in row] for row in cells])
+    return np.ma.masked_array(np.where(mask, 9999.0, cells).astype(float), mask)
+
+
+FRAMES = {
+    "pandas": pd.DataFrame,
+    "polars": lambda columns: _polars().DataFrame({n: _strict(c) for n, c in columns.items()}),
+    "lazy": lambda columns: _polars().LazyFrame({n: _strict(c) for n, c in columns.items()}),
+    "arrow": lambda columns: pa.table({n: _strict(c) for n, c in columns.items()}),
+    "mappings": lambda columns: [
+        dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)
+    ],
+}
+KEYS = {"labels": "fault", "time": "t[s]", "rate": 10, "sensors": ["flow[l/s]", "Größe"]}
+
+
+def by_frames(frames, folder, keys):
+    """Import episodes in memory, nominal ones first."""
+    said = []
+    parts = {"train": frames[:12], "calibration": frames[12:24], "test": frames[24:]}
+    options = {"missing": "hold", "output": folder, "replace": True, "report": said.append}
+    split = import_frames("frames", **parts, **options, **keys)
+    data = split.environment("frames")
+    parts = {"train": data.train, "calibration": data.calibration, "twins": data.twins}
+    parts |= {kind: data.labelled(kind) for kind in data.anomalies}
+    episodes = {(part, i): e.observations for part, es in parts.items() for i, e in enumerate(es)}
+    episodes |= {(k, "rows"): np.array(data.labelled(k).intervals) for k in data.anomalies}
+    return [q.name for q in data.sensors], episodes, said
+
+
+def title(i):
+    part = "train" if i < 12 else "calibration" if i < 24 else "test"
+    return f"{part}-{i % 12}"
+
+
+@pytest.fixture(scope="module")
+def clean_frames(tmp_path_factory):
+    @functools.cache
+    def read(library):
+        frames = [FRAMES[library](logs(i)) for i in range(FILES)]
+        return by_frames(frames, tmp_path_factory.mktemp(library), KEYS)
+
+    return read
+
+
+@pytest.mark.parametrize("library", FRAMES)
+@pytest.mark.parametrize("seed", range(16))
+def test_what_is_spoilt_in_memory_changes_nothing_or_is_said(library, seed, tmp_path, clean_frames):
+    rng = np.random.default_rng([seed, len(library)])
+    spoil, i = ANY[seed % len(ANY)], int(rng.integers(FILES))
+    log = Log(logs(i))
+    spoil(rng, log)
+    columns = [log.columns if j == i else logs(j) for j in range(FILES)]
+    try:
+        result = by_frames([*map(FRAMES[library], columns)], tmp_path, KEYS)
+        told = "\n".join(result[2])
+    except OoddError as error:
+        result, told = None, str(error)
+    if result is None or not equal(result, clean_frames(library)):
+        assert title(i) in told, (spoil.__name__, log.thing, told)
+        assert any(word in told for word in log.thing), (spoil.__name__, log.thing, told)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_masked_cells_are_missing(seed, tmp_path):
+    columns = [{n: logs(i)[n] for n in COLUMNS[1:3]} for i in range(FILES)]
+    rng = np.random.default_rng(seed)
+    i, name, row = int(rng.integers(24)), COLUMNS[1 + seed % 2], int(rng.integers(1, ROWS))
+    columns[i][name][row] = None
+    _, episodes, said = by_frames([*map(_masked, columns)], tmp_path, {})
+    assert max(x.max() for (_, k), x in episodes.items() if k != "rows") < 10
+    assert any(title(i) in line and f"row {row}" in line for line in said)
+    scan = scan_episodes([*map(_masked, columns)], detector="mahalanobis")
+    assert len(scan.episodes) == FILES
+    assert np.isnan(scan.episodes[i].episode.observations[row, 0 if name == COLUMNS[1] else 1])
