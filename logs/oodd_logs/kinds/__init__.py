@@ -124,8 +124,8 @@ def check_kind(kind: Kind) -> None:
 
 def flattened(name: str, value: Any) -> tuple[Kind, list[tuple[str, Any]]] | None:
     """Return the kind that knows a value in a message, and what it makes of it; None without."""
-    for kind in _of_messages():
-        if (pairs := kind.flatten(name, value)) is not None:  # type: ignore[misc]  those that have it
+    for kind, flatten in _of_messages():
+        if (pairs := flatten(name, value)) is not None:
             return kind, [*pairs]
     return None
 
@@ -148,8 +148,8 @@ def _ours() -> dict[str, Kind]:
 
 
 @functools.cache
-def _of_messages() -> tuple[Kind, ...]:
-    return tuple(kind for kind in kinds().values() if kind.flatten is not None)
+def _of_messages() -> list[tuple[Kind, Callable[[str, Any], Iterable[tuple[str, Any]] | None]]]:
+    return [(kind, kind.flatten) for kind in kinds().values() if kind.flatten is not None]
 
 
 _registered: Final[dict[str, Kind]] = {}

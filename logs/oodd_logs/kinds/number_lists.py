@@ -70,7 +70,7 @@ def as_numbers(value: Any) -> NDArray[np.float64] | None:
         items = array.ravel().tolist() if array.dtype.kind == "O" else [""]
         if not all(x is None or isinstance(x, int | float) for x in items):
             return None
-    return array.astype(np.float64)
+    return np.asarray(array, np.float64)
 
 
 KIND: Final = Kind(

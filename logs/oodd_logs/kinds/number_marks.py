@@ -74,9 +74,8 @@ def has_thousands(cells: Iterable[str], mark: str, decimal: str = "") -> bool | 
     """
     values = {cell.strip().lstrip("+-") for cell in cells}
     marked = {cell for cell in values if mark in cell and cell[0].isdigit()}
-    if not marked or not all(_GROUPED[mark].fullmatch(cell) for cell in marked):
-        return False
-    if any(_GROUPED[mark].fullmatch(cell)[1] == mark or cell[0] == "0" for cell in marked):  # type: ignore[index]  all fit
+    matches = [_GROUPED[mark].fullmatch(cell) for cell in marked if cell[0] != "0"]
+    if not matches or len(matches) < len(marked) or any(m is None or m[1] == mark for m in matches):
         return False
     other = "," if mark == "." else "."
     if decimal == other or any(other in cell or cell.count(mark) > 1 for cell in values):
@@ -87,7 +86,7 @@ def has_thousands(cells: Iterable[str], mark: str, decimal: str = "") -> bool | 
     # Decimals that are written as short as may be end in no 0; others have a mark in all cells.
     shortened = any(cell.endswith("0") for cell in marked)
     largest = max(float(cell.replace(mark, ".")) for cell in marked)
-    return True if shortened or np.median(single) > largest else None
+    return True if shortened or np.median(single) > 10 * largest else None
 
 
 def may_have_thousands(column: Column) -> bool:

@@ -130,7 +130,8 @@ def episode_of(
             if isinstance(part.column, str):
                 column = number_lists.figures("", block)[f".{part.column}"]
             else:
-                column = block[:, *part.column]
+                index: Any = (slice(None), *part.column)
+                column = block[index]
             if stop == rows and names[part.array] in {"action", "reward"}:
                 column = column[: rows - 1 - start]
             columns[label] = np.append(column, np.full(stop - start - len(column), np.nan))
@@ -165,7 +166,7 @@ def _label(
     if inner:
         return prefix + ".".join((inner, *map(str, steps)))
     if len(quantities) == width and len(steps) < 2:
-        quantity = quantities[steps[0] if steps else 0]  # type: ignore[index]  of one number each
+        quantity = quantities[int(steps[0]) if steps else 0]
         return prefix + quantity.name + ("" if quantity.unit == "1" else f"[{quantity.unit}]")
     return f"{prefix}{'sensor' if kind == 'obs' else kind} {'.'.join(map(str, steps or (0,)))}"
 

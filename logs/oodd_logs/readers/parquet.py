@@ -242,7 +242,7 @@ class _Columns:
     def _is_constant(self, name: str, size: int) -> bool:
         """Tell by the numbers that the file counts whether all lists are as long as the first."""
         pattern = re.compile(re.escape(re.sub(r"\.\d+\b", "", name)) + r"\.list\..*")
-        values = nulls = rows = 0
+        values, nulls, rows = 0, 0, 0
         for group in self.groups:
             for i in range(group.num_columns):
                 chunk = group.column(i)
@@ -251,7 +251,7 @@ class _Columns:
                     statistics = chunk.statistics
                     nulls += statistics.null_count or 0 if statistics else 0
             rows += group.num_rows
-        return size > 0 and (values == rows * size or values - nulls == size * (rows - nulls))
+        return size > 0 and 0 in {values - size * rows, values - nulls - size * (rows - nulls)}
 
 
 def _values(array: Any, leaf: _Leaf, path: Path) -> Column:

@@ -174,7 +174,7 @@ def _column(cells: list[str], name: str, layout: Layout, ledger: Ledger) -> Colu
         coded = [row for row in absent if numbers([cells[row]], strict=True) is None]
         for code in dict.fromkeys(cells[row] for row in coded):
             rows = [row for row in coded if cells[row] == code]
-            place = {"count": len(rows), "row": rows[0], "cell": code}
+            place: dict[str, Any] = {"count": len(rows), "row": rows[0], "cell": code}
             ledger.add("cell", "changed", "a code for what is missing", name=name, **place)
     return column
 
