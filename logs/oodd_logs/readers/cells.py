@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -179,6 +180,11 @@ def column_names(names: Iterable[str]) -> tuple[str, ...]:
     >>> column_names(["t", " x", "x", ""])
     ('t', 'x', 'x (2)', 'column 4')
     """
+    return _unique(tuple(names))
+
+
+@functools.lru_cache(64)  # episodes of a file have the same
+def _unique(names: tuple[str, ...]) -> tuple[str, ...]:
     plain = [" ".join(name.split()) or f"column {i}" for i, name in enumerate(names, start=1)]
     plain = [conventional(name) for name in plain]
     counts: Counter[str] = Counter()

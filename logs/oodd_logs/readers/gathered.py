@@ -182,6 +182,8 @@ class Gathered:
 
     def _column(self, parts: Sequence[_Part]) -> Column:
         if all(isinstance(values, np.ndarray) for _, values in parts):
+            if len(parts) == 1 and len(parts[0][0]) == self.rows:
+                return np.asarray(parts[0][1])
             column = np.full(self.rows, np.nan)
             for places, values in parts:
                 column[places] = values

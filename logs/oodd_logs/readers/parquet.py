@@ -174,24 +174,25 @@ def _objects(schema: Any) -> list[str]:
     """Return the columns whose rows are objects: with names or stamps among their values."""
     types = library("pyarrow").types
 
-    def is_list(kind: Any) -> bool:
-        return types.is_list(kind) or types.is_large_list(kind) or types.is_fixed_size_list(kind)
-
     def is_object(kind: Any) -> bool:
         if types.is_struct(kind):
-            return stamp_of({f.name: 0 for f in kind}) is not None or any(
-                is_object(f.type) for f in kind
-            )
-        if is_list(kind):
+            stamped = stamp_of({f.name: 0 for f in kind}) is not None
+            return stamped or any(is_object(f.type) for f in kind)
+        if _is_list(kind):
             inner = kind.value_type
-            while is_list(inner):
+            while _is_list(inner):
                 inner = inner.value_type
             return not (types.is_primitive(inner) or types.is_binary(inner))
         return bool(types.is_map(kind))
 
     objects = [f.name for f in schema if is_object(f.type)]
-    named = any(is_list(f.type) and types.is_string(f.type.value_type) for f in schema)
-    return [f.name for f in schema if f.name in objects or (named and is_list(f.type))]
+    named = any(_is_list(f.type) and types.is_string(f.type.value_type) for f in schema)
+    return [f.name for f in schema if f.name in objects or (named and _is_list(f.type))]
+
+
+def _is_list(kind: Any) -> bool:
+    types = library("pyarrow").types
+    return bool(types.is_list(kind) or types.is_large_list(kind) or types.is_fixed_size_list(kind))
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,7 +223,7 @@ class _Columns:
         if types.is_struct(kind):
             for f in kind:
                 yield from self._inner(column, f.type, (value or {}).get(f.name), (*steps, f.name))
-        elif types.is_fixed_size_list(kind) or types.is_list(kind) or types.is_large_list(kind):
+        elif _is_list(kind):
             size = kind.list_size if types.is_fixed_size_list(kind) else len(value or ())
             total = np.size(value) if value else size
             wide = any(fnmatch.fnmatch(name, glob) for glob in self.lists)
