@@ -25,6 +25,7 @@ from oodd_eval.data.facts import (
 from oodd_eval.errors import UnknownNameError, UsageError
 from oodd_eval.names import check_known
 from oodd_logs.kinds import kinds_by_key, missing_codes
+from oodd_logs.kinds.naming import read_names, read_text, wrong_value
 
 FAILURE: Final = "failure"
 """Kind of the episodes that failed, where a recipe names no other."""
@@ -63,26 +64,6 @@ def anomaly_name(text: str) -> str:
 
 
 # Readers of values: each takes what messages call the key, and the value.
-
-
-def wrong_value(key: str, value: Any, expected: str) -> UsageError:
-    """Return the error for a value of a recipe: what it is, and what was expected."""
-    return UsageError(f"{key} is {value!r:.100}, expected {expected}")
-
-
-def _text(key: str, value: Any) -> str:
-    if not isinstance(value, str) or not value.isprintable():
-        raise wrong_value(key, value, "a text in one line")
-    return value
-
-
-def read_names(key: str, value: Any) -> tuple[str, ...]:
-    """Return names or globs, of which a recipe has one or a list; `UsageError` for others."""
-    values = value if isinstance(value, list | tuple) else [value]
-    texts = tuple(_text(key, text) for text in values)
-    if "" in texts:
-        raise wrong_value(key, value, "texts that are not empty")
-    return texts
 
 
 def _globs(key: str, value: Any) -> tuple[str, ...]:
@@ -176,8 +157,8 @@ def _intervals(key: str, value: Any) -> str | tuple[Interval, ...]:
     for row in rows:
         if not isinstance(row, list | tuple) or len(row) not in {3, 4}:
             raise wrong_value(key, row, "[file, start, stop] or [file, start, stop, kind]")
-        kind = _text(key, row[3]) if len(row) == 4 else ""
-        intervals.append((_text(key, row[0]), _moment(key, row[1]), _moment(key, row[2]), kind))
+        kind = read_text(key, row[3]) if len(row) == 4 else ""
+        intervals.append((read_text(key, row[0]), _moment(key, row[1]), _moment(key, row[2]), kind))
     return tuple(intervals)
 
 
@@ -192,7 +173,7 @@ def _moment(key: str, value: Any) -> int | float | str | None:
     return value
 
 
-Text = Annotated[str, _text]
+Text = Annotated[str, read_text]
 Texts = Annotated[tuple[str, ...], read_names]
 Globs = Annotated[tuple[str, ...], _globs]
 Conditions = Annotated[Mapping[str, tuple[Any, ...]], _conditions]
@@ -456,7 +437,10 @@ class Recipe:
         values["columns"] = {key: values.pop(key) for key in kinds_by_key() if key in values}
         if codes := values["columns"].get(missing_codes.KEY):
             options[missing_codes.KEY] = codes
-        files = {"format": _text("[read]: format", options.pop("format", "")), "options": options}
+        files = {
+            "format": read_text("[read]: format", options.pop("format", "")),
+            "options": options,
+        }
         recipe = cls(**{"environment": values["split"]} | values | files)
         recipe.check(source)
         return recipe

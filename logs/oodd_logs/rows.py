@@ -17,11 +17,12 @@ from oodd_eval.data.facts import Quantity, Role
 from oodd_eval.errors import OutputError, TrajectoryError, UsageError
 from oodd_logs.kinds import Conversion, Matrix, kinds_by_key
 from oodd_logs.kinds.angles import FULL_TURN
+from oodd_logs.kinds.naming import matching
 from oodd_logs.ledger import Fate, Item, Ledger
 from oodd_logs.readers.cells import mixed
 from oodd_logs.recipe import Recipe
 from oodd_logs.recording import Column, Recording, Topic
-from oodd_logs.selecting import ChosenColumn, Selection, matches_any
+from oodd_logs.selecting import ChosenColumn, Selection
 from oodd_logs.stamps import Stretch
 
 _CELLS: Final = 1 << 18  # that are read at once
@@ -348,18 +349,15 @@ class Converter:
 
 def _with_roles(sensors: Sequence[Quantity], recipe: Recipe) -> list[Quantity]:
     """Return sensors with the roles that a recipe names, one each."""
-    names = [sensor.name for sensor in sensors]
-    named: dict[str, list[str]] = {}
+    named: dict[int, list[str]] = {}
     for role, patterns in recipe.roles.items():
-        matches_any(patterns, names, f"sensor whose role is {role}")
-        for name in names:
-            if matches_any(patterns, [name]):
-                named.setdefault(name, []).append(role)
-    for sensor in sensors:
-        roles = named.get(sensor.name, [])
+        for i in matching(patterns, sensors, f"sensor whose role is {role}"):
+            named.setdefault(i, []).append(role)
+    for i, roles in named.items():
         if len(roles) > 1:
-            raise UsageError(f"roles: {sensor.name!r} is {' and '.join(roles)}, expected one role")
-    return [replace(q, role=cast("Role", named.get(q.name, [q.role])[0])) for q in sensors]
+            name = sensors[i].name
+            raise UsageError(f"roles: {name!r} is {' and '.join(roles)}, expected one role")
+    return [replace(q, role=cast("Role", named.get(i, [q.role])[0])) for i, q in enumerate(sensors)]
 
 
 def _actions(columns: Sequence[ChosenColumn], recipe: Recipe) -> tuple[Quantity, ...]:

@@ -15,6 +15,7 @@ from typing import Final
 
 from oodd_eval.data.facts import Quantity
 from oodd_eval.errors import TrajectoryError, UnknownNameError, UsageError
+from oodd_logs.kinds.naming import pattern_of
 from oodd_logs.readers.cells import nearest_spelling
 from oodd_logs.recipe import Recipe
 from oodd_logs.recording import Column, Recording, Topic
@@ -157,7 +158,7 @@ def respellings(layout: Layout, recipe: Recipe, first: Layout | None) -> dict[tu
 
 def _exact(layout: Layout, text: str) -> list[tuple[str, str]]:
     """Return the columns that a text names as it is written; those of another unit, too."""
-    glob = _glob(split_unit(text)[0])
+    glob = pattern_of(split_unit(text)[0])
     return [
         (topic, name)
         for topic, names, _ in layout
@@ -373,7 +374,7 @@ def _matches(layout: Layout, text: str) -> list[ChosenColumn]:
     if {*stripped} & {*"*?"}:  # columns with the unit and without it
         readings = dict.fromkeys([split_unit(stripped), (stripped, ""), _named_unit(stripped)])
     for pattern, unit in readings:
-        glob = _glob(pattern)
+        glob = pattern_of(pattern)
         columns = [
             _with_unit(topic, name, unit)
             for topic, names, _ in layout
@@ -394,18 +395,3 @@ def _with_unit(topic: str, column: str, unit: str) -> ChosenColumn:
             "converted"
         )
     return ChosenColumn(topic, column, Quantity(name, unit or recorded_unit or "1"))
-
-
-def matches_any(patterns: Iterable[str], names: Sequence[str], kind: str = "") -> bool:
-    """Tell whether globs match any of some names; with a kind, each has to: an error if not."""
-    for pattern in patterns:
-        matches = any(_glob(pattern.strip()).fullmatch(name) for name in names)
-        if matches and not kind:
-            return True
-        if not matches and kind:
-            raise UnknownNameError(kind, pattern, names)
-    return False
-
-
-def _glob(pattern: str) -> re.Pattern[str]:
-    return re.compile(re.escape(pattern).replace(r"\*", ".*").replace(r"\?", "."))

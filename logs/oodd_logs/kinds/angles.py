@@ -8,8 +8,8 @@ import numpy as np
 from oodd_eval.data.facts import Quantity
 from oodd_eval.errors import UsageError
 from oodd_logs.kinds import Conversion, Kind
-from oodd_logs.kinds.wraps import matching, sine_and_cosine
-from oodd_logs.recipe import read_names
+from oodd_logs.kinds.naming import matching, read_names
+from oodd_logs.kinds.wraps import sine_and_cosine
 
 FULL_TURN: Final = dict.fromkeys(("deg", "°", "degree", "degrees"), 360.0)
 """Full turns in the units of angles other than radians."""

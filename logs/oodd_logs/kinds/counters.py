@@ -7,8 +7,7 @@ import numpy as np
 
 from oodd_eval.data.facts import Quantity
 from oodd_logs.kinds import Conversion, Kind, Matrix
-from oodd_logs.kinds.wraps import matching
-from oodd_logs.recipe import read_names
+from oodd_logs.kinds.naming import matching, read_names
 
 
 def _recognise(columns: Mapping[str, Any]) -> dict[str | tuple[str, ...], Any]:

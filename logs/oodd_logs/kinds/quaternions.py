@@ -9,7 +9,7 @@ import numpy as np
 from oodd_eval.data.facts import Quantity
 from oodd_eval.errors import UnknownNameError
 from oodd_logs.kinds import Conversion, Kind, Matrix
-from oodd_logs.recipe import read_names, wrong_value
+from oodd_logs.kinds.naming import read_names, wrong_value
 
 _LETTER: Final = re.compile(
     r"(?P<stem>.*?)(?P<part>[wxyz0-3]|q?(?:real|imag?)[wijk123]?)\W*", re.IGNORECASE

@@ -1,27 +1,13 @@
 """Columns that begin anew at the end of any period, such as encoders of 4096 ticks."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
 
 from oodd_eval.data.facts import Quantity, Role
 from oodd_logs.kinds import Conversion, Kind, Matrix
-from oodd_logs.recipe import wrong_value
-from oodd_logs.selecting import matches_any
-
-
-def matching(globs: Iterable[str], sensors: Sequence[Quantity], noun: str) -> list[int]:
-    """Return the positions of the sensors that globs match.
-
-    Raises
-    ------
-    UnknownNameError
-        When a glob matches none; `noun` says what it should be.
-    """
-    globs, names = [*globs], [sensor.name for sensor in sensors]
-    matches_any(globs, names, noun)
-    return [i for i, name in enumerate(names) if matches_any(globs, [name])]
+from oodd_logs.kinds.naming import matching, wrong_value
 
 
 def sine_and_cosine(position: int, sensor: Quantity, period: float) -> Conversion:
