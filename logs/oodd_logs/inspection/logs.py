@@ -350,9 +350,13 @@ class Inspection:
 
     def _lacking(self, recording: RecordingFacts) -> set[str]:
         """Return the columns that are sensors by their role, or times, and not in a recording."""
-        needed = {n for n, role in self._basic_roles.items() if not role or n in self.times}
-        needed &= {n for n in needed if self.topic_of(n) in recording.rows or n not in self.times}
+        times = {name for name in self.times if self.topic_of(name) in recording.rows}
+        needed = times | self._candidates
         return (needed - {*recording.columns}) | (needed & recording.empty)
+
+    @cached_property
+    def _candidates(self) -> set[str]:
+        return {name for name, role in self._basic_roles.items() if not role}
 
     @cached_property
     def usable(self) -> list[str]:
@@ -383,7 +387,7 @@ class Inspection:
         named = [name for name in self.columns if name.startswith("obs:")]
         return named or [name for name, role in self.roles.items() if not role]
 
-    def _names(self, topic: Topic, below: str, source: str) -> dict[str, str]:
+    def _names(self, topic: Topic, below: str, file: str) -> dict[str, str]:
         """Return the names of a topic's columns among all, which others may spell otherwise."""
         whole, names = {f"{below}{name}" for name in topic.names}, {}
         for name in topic.names:
@@ -393,7 +397,7 @@ class Inspection:
             known = self._spellings.setdefault((below, plain_name(name)), names[name])
             units = {plain_unit(split_unit(text)[1]) for text in (known, name)} - {""}
             if known not in whole and len(units) < 2:
-                self._written.setdefault(known, {}).setdefault(names[name], []).append(source)
+                self._written.setdefault(known, {}).setdefault(names[name], []).append(file)
                 names[name] = known
         return names
 
@@ -414,24 +418,23 @@ class Inspection:
             self.ledger.add("recording", "dropped", "no rows", source=f"{file}, {name}")
         new: dict[str, str] = {}
         for name, others in self._written.items():
-            counts = {name: self.columns[name].recordings - sum(map(len, others.values()))}
-            counts |= {other: len(sources) for other, sources in others.items()}
-            new[name] = max(counts, key=lambda spelling: counts[spelling])
-            for other, sources in others.items() if new[name] == name else ():
+            with_name = {r.file: None for r in self.recordings if name in r.columns}
+            with_name = {f: None for f in with_name if not any(f in o for o in others.values())}
+            spellings = {name: [*with_name], **others}
+            new[name] = max(spellings, key=lambda spelling: len(spellings[spelling]))
+            for other in spellings.keys() - {new[name]}:
                 reason = f"taken from {other!r}, as the file lacks it"
-                for source in sources:
-                    self.ledger.add("column", "changed", reason, name=name, source=source)
+                for file in spellings[other]:
+                    self.ledger.add("column", "changed", reason, name=new[name], source=file)
         if {*new} - {*new.values()}:
             self.columns = {new.get(name, name): facts for name, facts in self.columns.items()}
             self.recordings = [recording.renamed(new) for recording in self.recordings]
-        for name in (n for n in self.columns if n not in self.labels):
-            facts = self.columns[name]
-            for (reason, source), (count, row, cell) in facts.exceptions.items():
-                values: dict[str, Any] = {"count": count, "source": source, "row": row}
-                if not facts.text:
-                    self.ledger.add(
-                        "cell", EXCEPTIONS[reason], reason, name=name, cell=cell, **values
-                    )
+        for name, facts in self.columns.items():
+            if not facts.text and name not in self.labels:
+                for (reason, source), (count, row, cell) in facts.exceptions.items():
+                    place: dict[str, Any] = {"source": source, "row": row, "cell": cell}
+                    fate = EXCEPTIONS[reason]
+                    self.ledger.add("cell", fate, reason, name=name, count=count, **place)
         for recording in (r for r in self.recordings if r.file not in self.usable):
             for name in sorted(self._lacking(recording) & recording.empty):
                 where = recording.file
@@ -476,7 +479,7 @@ class Inspection:
             self._work_off()
         for topic_name, topic in topics:
             below = f"{topic_name}." if topic_name else ""
-            names = self._names(topic, below, source)
+            names = self._names(topic, below, file)
             columns += names.values()
             facts = {n: self.columns.setdefault(name, ColumnFacts()) for n, name in names.items()}
             likely: list[tuple[str, ...]] = []

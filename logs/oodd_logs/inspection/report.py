@@ -35,6 +35,7 @@ from oodd_logs.readers import quantity
 from oodd_logs.recipe import MISSING_ROWS
 from oodd_logs.stamps import GAP_STEPS
 
+_SEEN: Final = "training has seen the test"
 _LINES: Final = 12  # of the ledger
 _MANY: Final = 60  # columns beyond which the table has only those that look like something
 
@@ -44,47 +45,6 @@ class Advice(NamedTuple):
 
     topic: str
     text: str
-
-
-_TEXTS: Final = {
-    "unreadable": "{problem}",
-    "others": "{files} of other formats: {endings}",
-    "sample": "{cells} of {rows} rows were looked at, in blocks over all of them",
-    "equal": "{files}: the same rows; name one, or training has seen the test",
-    "shared": "episodes that stand in another file, too: {counts}; name one of the files, or "
-    "training has seen the test",
-    "continued": "the last {rows} rows of {first} are the first of {second}: leave one out, or "
-    "training has seen the test",
-    "transposed": "rows and columns of {files} are exchanged (and were read so): write "
-    "transpose = {toml} below [read]",
-    "headers": "episodes differ in their columns ({sizes}): not in all, as sensors have to be: "
-    "{names}",
-    "topics": "{n} topics at rates of their own are joined: write rate = {rate}, and sensors as "
-    "topic.field",
-    "time": "{name} has {unit}, a row every {step} s: write {keys}",
-    "rates": "a row every {steps} s in {files}: rate = {rate} resamples all to the slowest, so "
-    "that no value is held for several rows",
-    "gaps": "{gaps} of more than {steps} steps, the longest {longest} s before row {row} of "
-    "{file}: gap = {gap} cuts recordings there",
-    "falls": "{rows} earlier than the row before: gap = {gap} cuts recordings there",
-    "missing": "{names}: {share} of values are missing{worst}, up to {longest} in a run{leading}: "
-    'write missing = "hold"{most}',
-    "float32": "{names}: little change for the size ({first}: {spread} around {mean}), which "
-    "float32 would lose: the import subtracts training's mean in float64",
-    "intervals": '{file} names rows of files: write intervals = "{file}"',
-    "labels": "{label} may say what is anomalous: {anomalous} of {rows} rows, in {some} of "
-    '{episodes}: write labels = "{label}"{nominal}{also}',
-    "fields": "{name} of each episode: {values}{key}",
-    "nominal": "nothing says what is anomalous: all counts as nominal until a recipe names files "
-    "below [anomalous.NAME]",
-    "few": "{episodes}: an alarm that at most 10 % of them raise needs 9 for calibration alone, "
-    "one at 5 % 19 (twice as many for detectors whose alarm is a CUSUM){window}",
-}
-"""Words of advice by topic; what is in braces comes from the logs."""
-
-
-def _say(topic: str, **values: Any) -> Advice:
-    return Advice(topic, _TEXTS[topic].format_map(values))
 
 
 def advise(logs: Inspection) -> list[Advice]:
@@ -106,27 +66,33 @@ def advise(logs: Inspection) -> list[Advice]:
 
 def _of_files(logs: Inspection) -> Iterator[Advice]:
     for problem in logs.problems[:3]:
-        yield _say("unreadable", problem=problem)
+        yield Advice("unreadable", problem)
     if logs.others:
         endings = ", ".join(f"{n} {s or 'without an ending'}" for s, n in logs.others.items())
-        yield _say("others", files=counted(logs.others.total(), "file(s)"), endings=endings)
+        files = counted(logs.others.total(), "file(s)")
+        yield Advice("others", f"{files} of other formats: {endings}")
     if any(recording.length > READ_ROWS for recording in logs.recordings):
         cells = max(column.cells for column in logs.columns.values())
-        yield _say("sample", cells=cells, rows=sum(r.length for r in logs.recordings))
+        rows = sum(recording.length for recording in logs.recordings)
+        yield Advice("sample", f"{cells} of {rows} rows were looked at, in blocks over all of them")
     for same in logs.equal:
-        yield _say("equal", files=listed(same))
+        yield Advice("equal", f"{listed(same)}: the same rows; name one, or {_SEEN}")
     if logs.shared:
         counts = listed([f"{n} of {file}" for file, n in logs.shared.items()])
-        yield _say("shared", counts=counts)
-    for first, second, rows in logs.continued[:3]:
-        yield _say("continued", rows=rows, first=first, second=second)
-    if files := logs.transposed:
-        yield _say("transposed", files=listed(files), toml=toml(files))
+        text = f"episodes that stand in another file, too: {counts}; name one of the files, or "
+        yield Advice("shared", text + _SEEN)
+    for first, second, n in logs.continued[:3]:
+        text = f"the last {n} rows of {first} are the first of {second}: leave one out, or {_SEEN}"
+        yield Advice("continued", text)
+    if logs.transposed:
+        text = f"rows and columns of {listed(logs.transposed)} are exchanged (and were read so): "
+        yield Advice("transposed", f"{text}write transpose = {toml(logs.transposed)} below [read]")
     headers = Counter(r.columns for r in logs.recordings)
     if len(headers) > 1:
         partial = [n for n, c in logs.columns.items() if c.recordings < len(logs.recordings)]
         sizes = ", ".join(f"{len(names)} columns in {n}" for names, n in headers.most_common(3))
-        yield _say("headers", sizes=sizes, names=listed(partial))
+        text = f"episodes differ in their columns ({sizes}): not in all, as sensors have to be: "
+        yield Advice("headers", text + listed(partial))
 
 
 def _of_times(logs: Inspection) -> Iterator[Advice]:
@@ -134,26 +100,31 @@ def _of_times(logs: Inspection) -> Iterator[Advice]:
     if not times:
         yield Advice("time", "no column has times: rows count as equally spaced")
     if len(times) > 1:
-        yield _say("topics", n=len(times), rate=rate)
+        text = f"{len(times)} topics at rates of their own are joined: write rate = {rate}, and "
+        yield Advice("topics", f"{text}sensors as topic.field")
     if len(times) != 1:
         return
     ((name, unit),) = times.items()
-    clocks, step = logs.clocks(name), step_of(logs, name)
-    keys = time_lines(logs, name, unit) + ([f"rate = {rate}"] if step > 0 else [])
-    yield _say("time", name=name, unit=UNIT_NAMES[unit], step=number(step), keys=", ".join(keys))
+    clocks, step, cuts = logs.clocks(name), step_of(logs, name), "cuts recordings there"
+    keys = ", ".join(time_lines(logs, name, unit) + ([f"rate = {rate}"] if step > 0 else []))
+    text = f"{name} has {UNIT_NAMES[unit]}, a row every {number(step)} s: write {keys}"
+    yield Advice("time", text)
     rates = [(r, clock.steps.usual * SCALES[unit]) for r, clock in clocks]
     if other_rates := [(r.file, other) for r, other in rates if abs(other - step) > 0.1 * step]:
         steps = listed(sorted({number(other) for _, other in other_rates}))
-        yield _say("rates", files=listed([file for file, _ in other_rates]), steps=steps, rate=rate)
+        files = listed([file for file, _ in other_rates])
+        text = f"a row every {steps} s in {files}: rate = {rate} resamples all to the slowest, so "
+        yield Advice("rates", f"{text}that no value is held for several rows")
     gaps, falls = cuts_of(logs)
     gap = number(gap_of(logs))
     if gaps:
         recording, clock = max(clocks, key=lambda pair: pair[1].steps.longest)
         longest, row = number(clock.steps.longest * SCALES[unit]), clock.steps.after + 1
-        values = {"longest": longest, "row": row, "file": recording.file, "gap": gap}
-        yield _say("gaps", gaps=counted(gaps, "gap(s)"), steps=GAP_STEPS, **values)
+        text = f"{counted(gaps, 'gap(s)')} of more than {GAP_STEPS} steps, the longest {longest} s "
+        yield Advice("gaps", f"{text}before row {row} of {recording.file}: gap = {gap} {cuts}")
     if falls:
-        yield _say("falls", rows=counted(falls, "row(s)"), gap=gap)
+        text = f"{counted(falls, 'row(s)')} earlier than the row before: gap = {gap} {cuts}"
+        yield Advice("falls", text)
 
 
 def _of_columns(logs: Inspection) -> Iterator[Advice]:
@@ -168,56 +139,59 @@ def _of_columns(logs: Inspection) -> Iterator[Advice]:
         worst = max(missing, key=lambda name: missing[name])
         longest = max(plain[name].longest for name in missing)
         leading = max(plain[name].leading for name in missing)
-        yield _say(
-            "missing",
-            names=listed([*missing]),
-            worst=f" in {worst}, fewer in others" if len(missing) > 1 else "",
-            share=_share(missing[worst]),
-            leading=f", {counted(leading, 'row(s)')} at the start" if leading else "",
-            longest=counted(longest, "row(s)"),
-            most=f", missing_rows = {longest}" if longest > MISSING_ROWS else "",
-        )
+        text = f"{listed([*missing])}: {_share(missing[worst])} of values are missing"
+        text += f" in {worst}, fewer in others" if len(missing) > 1 else ""
+        text += f", up to {counted(longest, 'row(s)')} in a run"
+        text += f", {counted(leading, 'row(s)')} at the start" if leading else ""
+        most = f", missing_rows = {longest}" if longest > MISSING_ROWS else ""
+        yield Advice("missing", f'{text}: write missing = "hold"{most}')
     for name, found in logs.kinds.items():
         kind, names = kinds()[name], [n for together in found for n in together]
         text = kind.words.format(names=listed(names), line=line_of(kind, found))
         yield Advice(f"{name}s", text)
     if coarse := [name for name, c in plain.items() if c.coarse]:
         spread, mean = plain[coarse[0]].numbers.spread, plain[coarse[0]].numbers.mean
-        texts = {"spread": number(spread), "mean": number(mean)}
-        yield _say("float32", names=listed(coarse), first=coarse[0], **texts)
+        text = (
+            f"{listed(coarse)}: little change for the size ({coarse[0]}: {number(spread)} around "
+        )
+        text += f"{number(mean)}), which float32 would lose: the import subtracts training's mean "
+        yield Advice("float32", f"{text}in float64")
 
 
 def _of_labels(logs: Inspection) -> Iterator[Advice]:
     if logs.intervals:
-        yield _say("intervals", file=logs.intervals)
+        text = f'{logs.intervals} names rows of files: write intervals = "{logs.intervals}"'
+        yield Advice("intervals", text)
     if labels := logs.labels:
         values = nominal_values(logs, labels[0])
         _, reason = likely_nominal(labels[0], logs.columns[labels[0]].values or {})
         plain = [*map(plain_label, values)]
         anomalous = [anomalous_rows(r, labels[0], values) for r in logs.recordings]
-        yield _say(
-            "labels",
-            label=labels[0],
-            anomalous=sum(anomalous),
-            rows=sum(sum(r.values.get(labels[0], {}).values()) for r in logs.recordings),
-            some=sum(map(bool, anomalous)),
-            episodes=counted(len(logs.recordings), "episode(s)"),
-            nominal="" if values == (0.0,) else f", nominal_label = {toml(plain)}{reason}",
-            also=f"; perhaps {listed(labels[1:])}" if len(labels) > 1 else "",
-        )
+        rows = sum(sum(r.values.get(labels[0], {}).values()) for r in logs.recordings)
+        text = f"{labels[0]} may say what is anomalous: {sum(anomalous)} of {rows} rows, in "
+        text += f"{sum(map(bool, anomalous))} of {counted(len(logs.recordings), 'episode(s)')}: "
+        text += f"write labels = {toml(labels[0])}"
+        text += "" if values == (0.0,) else f", nominal_label = {toml(plain)}{reason}"
+        text += f"; perhaps {listed(labels[1:])}" if len(labels) > 1 else ""
+        yield Advice("labels", text)
     keys = keys_of_fields(logs)
     for name, counts in fields_of(logs).items():
         common = ", ".join(f"{value} ({n})" for value, n in counts.most_common(6))
         key = "".join(f': write {key} = "{name}"' for key in keys if keys[key] == name)
-        yield _say("fields", name=name, values=common, key=key)
+        yield Advice("fields", f"{name} of each episode: {common}{key}")
     if not (sort_files(logs).anomalous or labels or {"outcome", "kinds"} & {*keys}):
-        yield _say("nominal")
+        text = "nothing says what is anomalous: all counts as nominal until a recipe names files "
+        yield Advice("nominal", f"{text}below [anomalous.NAME]")
     if 0 < (nominal := len(nominal_recordings(logs))) < ENOUGH:
         window = window_of(logs)
         advised = f": window = {window} cuts recordings into more" if window else ""
         if window and lacks_rows(logs):
             advised += ", once labels, intervals or an onset say which rows are anomalous"
-        yield _say("few", episodes=counted(nominal, "nominal episode(s)"), window=advised)
+        text = (
+            f"{counted(nominal, 'nominal episode(s)')}: an alarm that at most 10 % of them raise "
+        )
+        text += "needs 9 for calibration alone, one at 5 % 19 (twice as many for detectors whose "
+        yield Advice("few", f"{text}alarm is a CUSUM){advised}")
 
 
 def looks_like(logs: Inspection) -> dict[str, str]:
