@@ -309,7 +309,8 @@ def _blocks(path: Path, layout: Layout, ledger: Ledger) -> Iterator["_Block"]:
             # In pieces: reading reserves as much memory as it is asked for.
             pieces = [*itertools.islice(iter(lambda: file.read(_PIECE), ""), -(-_BLOCK // _PIECE))]
             last = sum(map(len, pieces)) < _BLOCK
-            text = "".join(_ZEROS.sub("\0", piece) for piece in pieces) + _line(file, path)
+            text = "".join(_ZEROS.sub("\0", piece) for piece in [*pieces, _line(file, path)])
+            del pieces
             extra = len(text) + LINE_CHARACTERS
             # A line may end within quotes.
             while text.count('"') % 2 and len(text) < extra and (more := file.readline(2**16)):
@@ -388,27 +389,28 @@ class _Block:
         """Return the columns of a block where every cell but the last row's is a plain number."""
         # Rows of that kind are most there are, and NumPy reads them in half of the time. The last
         # row may lack cells: nothing is commanded after the last observation.
-        body, newline, end = self.text.rstrip("\n").rpartition("\n")
+        source = self.text.rstrip("\n")
+        body, _, end = source.rpartition("\n")
         layout, width = self.layout, len(self.layout.names)
         try:
             (row,) = layout.split([end])
             if self.last and self._is_cut(row):
                 return None
             cells = [number(cell, layout.decimal) for cell in row + [""] * (width - len(row))]
-            source = body
+            is_filled = len(row) == width and not np.isnan(cells).any()
+            source = source if is_filled else body
             if layout.decimal == ",":
-                source = body.replace(".", "?").replace(",", ".")
-            delimiter = None if layout.separator == BLANKS else layout.separator
-            above = np.empty((0, width))
-            if newline:
-                above = np.loadtxt(
-                    source.split("\n"), delimiter=delimiter, comments=None, quotechar='"', ndmin=2
-                )
+                source = source.replace(".", "?").replace(",", ".")
+            mark = None if layout.separator == BLANKS else layout.separator
+            block = np.empty((0, width))
+            if source:
+                lines = source.split("\n")
+                block = np.loadtxt(lines, delimiter=mark, comments=None, quotechar='"', ndmin=2)
         except ValueError:
             return None
-        if not any(row) or len(cells) != width or above.shape[1] != width:
+        if not any(row) or len(cells) != width or block.shape[1] != width:
             return None
-        return [*np.concatenate([above, [cells]]).T]
+        return [*(block if is_filled else np.concatenate([block, [cells]])).T]
 
     def _is_cut(self, row: list[str]) -> bool:
         """Tell whether the last row ends where it stands, and lacks more than commands."""
