@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from oodd_eval.errors import TrajectoryError
+from oodd_logs.ledger import Ledger
 from oodd_logs.readers import TOPICS, Options, Reader, chosen, library
 from oodd_logs.readers.cells import column_names
 from oodd_logs.recording import Recording, Topic
@@ -24,8 +25,14 @@ def _open(path: Path, options: Options) -> Iterator[Recording]:
     said = io.StringIO()  # the library prints what is damaged
     with contextlib.redirect_stdout(said):
         log = core.ULog(str(path))
+    ledger = Ledger()
     if log.file_corruption:
-        raise TrajectoryError(f"{path} is damaged: {' '.join(said.getvalue().split())[:200]}")
+        damage = " ".join(said.getvalue().split())[:200]
+        if not log.data_list:
+            raise TrajectoryError(f"{path} is damaged: {damage}")
+        ledger.add(
+            "recording", "changed", "it is damaged: parts that could be read are kept", cell=damage
+        )
     topics = {
         f"{data.name}_{data.multi_id}" if data.multi_id else data.name: data.data
         for data in log.data_list
@@ -34,7 +41,7 @@ def _open(path: Path, options: Options) -> Iterator[Recording]:
     if not selected:
         raise TrajectoryError(f"{path} has no messages")
     fields = {"dropouts": len(log.dropouts), "first_second": log.start_timestamp / 1e6}
-    yield Recording(path.stem, str(path), {n: _topic(topics[n]) for n in selected}, fields)
+    yield Recording(path.stem, str(path), {n: _topic(topics[n]) for n in selected}, fields, ledger)
 
 
 def _topic(data: dict[str, Any]) -> Topic:
