@@ -9,9 +9,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-import numpy as np
 from numpy.typing import NDArray
 
+from oodd_eval.arrays import as_array, as_numbers
 from oodd_eval.errors import TrajectoryError
 from oodd_logs.ledger import Ledger
 
@@ -54,7 +54,7 @@ class Topic:
         Parameters
         ----------
         columns
-            Arrays of equal length by name.
+            Arrays of equal length by name; what is masked is missing.
         time
             Name of the column with seconds, if any.
 
@@ -67,10 +67,9 @@ class Topic:
         TrajectoryError
             When lengths differ.
         """
-        arrays = {name: np.asarray(values) for name, values in columns.items()}
+        arrays = {name: as_array(values) for name, values in columns.items()}
         for name, array in arrays.items():
-            if array.dtype.kind != "U":
-                arrays[name] = np.asarray(array, np.float64)
+            arrays[name] = array if array.dtype.kind == "U" else as_numbers(array)
         lengths = {name: len(values) for name, values in arrays.items()}
         if len({*lengths.values()}) > 1:
             raise TrajectoryError(f"columns have lengths {lengths}, expected equal ones")

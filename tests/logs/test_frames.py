@@ -6,7 +6,7 @@ import types
 
 import numpy as np
 import pytest
-from oodd_logs import import_frames, scan_episodes
+from oodd_logs import Topic, import_frames, scan_episodes
 from oodd_logs.episodes import EVERY
 from oodd_logs.frames import recordings_of, scanned_frames
 
@@ -288,3 +288,9 @@ def test_wrong_arguments(tmp_path):
     )
     assert len(scan.episodes) == 12
     assert "episode 12" in "".join(scan.ledger.lines())
+
+
+def test_a_reader_may_hand_masked_columns_over():
+    topic = Topic.of({"a": masked([1, 9999, 3]), "b": masked(["x", "9999", "z"])})
+    cells = topic.read(["a", "b"], 0, 3)
+    assert np.isnan(cells["a"]).tolist() == (cells["b"] == "").tolist() == MASK
