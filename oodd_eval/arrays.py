@@ -25,13 +25,15 @@ def in_memory(values: Any) -> Any:
     return values
 
 
-def as_array(values: Any) -> NDArray[Any]:
+def as_array(values: Any, subject: str = "") -> NDArray[Any]:
     """Return values as an array whose missing entries are NaN, NaT, empty, or None among objects.
 
     Parameters
     ----------
     values
         An array, a list of rows, a column or a data frame. Of masked entries nothing goes on.
+    subject
+        What messages begin with.
 
     Raises
     ------
@@ -50,16 +52,16 @@ def as_array(values: Any) -> NDArray[Any]:
         data[array.mask] = _EMPTY.get(data.dtype.kind, np.nan)
     except Exception as error:  # each library raises its own
         kind = type(values).__name__
-        raise TrajectoryError(f"a {kind} is no array of (rows, sensors): {error}") from error
+        raise TrajectoryError(f"{subject}a {kind} is no array of rows: {error}") from error
     return data
 
 
-def as_numbers(values: Any) -> NDArray[np.float64]:
+def as_numbers(values: Any, subject: str = "") -> NDArray[np.float64]:
     """Return numbers as float64, NaN where an entry is missing or masked.
 
     Parameters
     ----------
-    values
+    values, subject
         As for `as_array`.
 
     Raises
@@ -72,13 +74,13 @@ def as_numbers(values: Any) -> NDArray[np.float64]:
     >>> as_numbers(np.ma.masked_values([1.0, 9999.0], 9999.0)), as_numbers([1, None])
     (array([ 1., nan]), array([ 1., nan]))
     """
-    array = as_array(values)
+    array = as_array(values, subject)
     if kind := _NOT_REAL.get(array.dtype.kind):
-        raise TrajectoryError(f"there are {kind} ({array.dtype}), expected real numbers")
+        raise TrajectoryError(f"{subject}{kind} ({array.dtype}), expected real numbers")
     try:
         if array.dtype.kind != "O":
             return array.astype(np.float64, copy=False)
         cells = (np.nan if is_missing(cell) else float(cell) for cell in array.flat)
         return np.fromiter(cells, np.float64, array.size).reshape(array.shape)
     except (TypeError, ValueError) as error:
-        raise TrajectoryError(f"there are values that are no real numbers: {error}") from None
+        raise TrajectoryError(f"{subject}some are no real numbers: {error}") from None

@@ -180,10 +180,7 @@ def _raw(episode: Episode) -> Trajectory | tuple[Floats, ArrayLike | None]:
     actions: ArrayLike | None = None
     if isinstance(episode, tuple) and len(episode) == 2 and np.ndim(episode[0]) == 2:
         observations, actions = episode
-    try:
-        array = as_numbers(observations)
-    except TrajectoryError as error:
-        raise TrajectoryError(f"an episode cannot be read as numbers: {error}") from None
+    array = as_numbers(observations, "an episode cannot be read as numbers: ")
     if array.ndim != 2 or 0 in array.shape or not np.isfinite(array).all():
         raise TrajectoryError(
             f"an episode has observations of shape {array.shape}, expected a Trajectory, finite "

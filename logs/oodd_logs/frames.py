@@ -146,10 +146,7 @@ def _columns(episode: Any, time: str) -> dict[str, Column]:
 
 
 def _matrix(values: Any, name: str) -> dict[str, Column]:
-    try:
-        array = as_numbers(values)
-    except TrajectoryError as error:
-        raise TrajectoryError(f"{error}; an episode is {_FORMS}") from error
+    array = as_numbers(values)
     array = array[:, None] if array.ndim == 1 else array
     if array.ndim != 2:
         raise TrajectoryError(f"it is an array of shape {array.shape}, expected {_FORMS}")
@@ -164,20 +161,18 @@ def _column(values: Any, label: object) -> Column:
         values = values.to_numpy()
     elif isinstance(values, list) and any(isinstance(cell, str) for cell in values):
         values = np.fromiter(values, object, len(values))  # in which NaN is no text
-    try:
-        array = as_array(values)
-        if array.ndim == 1 and array.dtype.kind == "M":
-            return np.where(np.isnat(array), "", np.datetime_as_string(array.astype("M8[ns]")))
-        if array.ndim == 1 and array.dtype.kind in "OSTU":
-            cells = [_cell(cell) for cell in array.tolist()]
-            if any(isinstance(cell, str) for cell in cells):
-                return np.array(["" if cell is None else str(cell) for cell in cells])
-            array = np.fromiter(cells, object, len(cells))
-        elif array.dtype.kind == "m":
-            array = array / np.timedelta64(1, "s")
-        numbers = as_numbers(array)
-    except TrajectoryError as error:
-        raise TrajectoryError(f"column {label!r}: {error}") from error
+    subject = f"column {label!r}: "
+    array = as_array(values, subject)
+    if array.ndim == 1 and array.dtype.kind == "M":
+        return np.where(np.isnat(array), "", np.datetime_as_string(array.astype("M8[ns]")))
+    if array.ndim == 1 and array.dtype.kind in "OSTU":
+        cells = [_cell(cell) for cell in array.tolist()]
+        if any(isinstance(cell, str) for cell in cells):
+            return np.array(["" if cell is None else str(cell) for cell in cells])
+        array = np.fromiter(cells, object, len(cells))
+    elif array.dtype.kind == "m":
+        array = array / np.timedelta64(1, "s")
+    numbers = as_numbers(array, subject)
     if numbers.ndim != 1:
         shape = numbers.shape[1:]
         raise TrajectoryError(f"column {label!r} has cells of shape {shape}, expected one number")

@@ -74,29 +74,26 @@ class RunningMoments:
         return np.maximum(np.abs(self.low), np.abs(self.high))
 
 
-def is_coarse(spread: Any, largest: Any) -> Any:
-    """Tell which spreads float32 cannot tell well enough, given the largest values."""
+def is_coarse(spread: Any, largest: Any, least: int = STEPS) -> Any:
+    """Tell which spreads have fewer steps of float32 than they need, given the largest values."""
     with np.errstate(over="ignore", invalid="ignore"):
         steps = np.spacing(np.float32(largest)).astype(np.float64)
-    return (spread > 0) & (spread < STEPS * steps)
+    return (spread > 0) & (spread < least * steps)
 
 
 def coarse_sensors(observations: Floats) -> str:
     """Return in a sentence which sensors of an episode lose their changes in float32, if any do.
 
     >>> print(coarse_sensors(5_412_345.0 + 0.02 * np.eye(2, 1)).partition(":")[0])
-    float32 rounds sensor 0, 5.41235e+06 with a spread of 0.01, to steps of 0.5
+    float32 rounds off what sensor 0 tells, 5.41235e+06 +- 0.01
     """
     with np.errstate(all="ignore"):  # what is not finite is refused elsewhere
         spread, largest = observations.std(axis=0), np.abs(observations).max(axis=0)
-        rounded, steps = observations.astype(np.float32), np.spacing(np.float32(largest))
-    coarse = (spread < _LOST * steps) & (spread > _STILL * largest)
-    for d in np.flatnonzero(coarse & (rounded != observations).any(axis=0))[:1]:
-        return (
-            f"float32 rounds sensor {d}, {largest[d]:g} with a spread of {spread[d]:.1g}, to steps "
-            f"of {steps[d]:.1g}: hand arrays of float64 over to Watchdog.fit and scan_episodes, "
-            "which subtract a mean before, or subtract one yourself"
-        )
+        is_rounded = (observations.astype(np.float32) != observations).any(axis=0)
+        is_lost = is_coarse(spread, largest, _LOST) & (spread > _STILL * largest) & is_rounded
+    for d in np.flatnonzero(is_lost)[:1]:
+        text = f"float32 rounds off what sensor {d} tells, {largest[d]:g} +- {spread[d]:.1g}: "
+        return f"{text}hand float64 arrays to Watchdog.fit or scan_episodes, or subtract a mean"
     return ""
 
 

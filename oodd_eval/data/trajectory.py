@@ -135,11 +135,10 @@ def _matrix(name: str, values: ArrayLike) -> NDArray[np.float32]:
         raise TrajectoryError(f"{name} have shape {array.shape}, expected (rows, columns){some}")
     bad = ~np.isfinite(array)
     if bad.any():
-        row, column = (int(i) for i in np.argwhere(bad)[0])
+        row, column = np.argwhere(bad)[0].tolist()
         raise TrajectoryError(
-            f"{name} hold {int(bad.sum())} values that are not finite, missing or masked, the "
-            f"first at row {row}, column {column}: {array[row, column]}; a trajectory has finite "
-            "values only"
+            f"{name} hold {int(bad.sum())} values that are not finite, missing or masked, expected "
+            f"none; the first is at row {row}, column {column}: {array[row, column]}"
         )
     array.flags.writeable = False
     return array
@@ -150,11 +149,8 @@ def _numbers(name: str, values: ArrayLike) -> NDArray[np.float64]:
     from oodd_eval.arrays import as_numbers  # noqa: PLC0415  splits have float32
     from oodd_eval.data.offsets import coarse_sensors  # noqa: PLC0415  as above
 
-    try:
-        numbers = as_numbers(values)
-    except TrajectoryError as error:
-        raise TrajectoryError(f"{name} cannot be read as a float32 matrix: {error}") from None
-    is_matrix = name == "observations" and numbers.ndim == 2 and len(numbers)
-    if is_matrix and (text := coarse_sensors(numbers)):
+    numbers = as_numbers(values, f"{name} cannot be read as a float32 matrix: ")
+    is_matrix = numbers.ndim == 2 and len(numbers)
+    if is_matrix and name == "observations" and (text := coarse_sensors(numbers)):
         warnings.warn(text, PrecisionWarning, stacklevel=4)
     return numbers

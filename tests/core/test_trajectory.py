@@ -121,6 +121,6 @@ def test_readings_that_float32_cannot_tell_are_told(offset, spread, told):
         episode = Trajectory(rows)
         Trajectory(rows.astype(np.float32))[:20].without_actions()
     assert [w.category for w in caught] == [PrecisionWarning] * told
-    assert all("float32 rounds sensor 1," in str(w.message) for w in caught)
+    assert all("float32 rounds off what sensor 1 tells," in str(w.message) for w in caught)
     assert all(w.filename == __file__ for w in caught)
     assert np.array_equal(episode.observations, rows.astype(np.float32))

@@ -251,7 +251,7 @@ def doubled_in_arrow():
         (doubled, "several columns '1'"),
         (doubled_in_arrow, "several columns 'a'"),
         (lambda: np.zeros((3, 2), complex), "complex numbers"),
-        (lambda: {"a": [1j, 2]}, "column 'a': there are complex numbers"),
+        (lambda: {"a": [1j, 2]}, "column 'a': complex numbers"),
         (lambda: np.array([[1, "x"]], object), "'x'"),
         (lambda: np.zeros((3, 2), "M8[s]"), "dates"),
         (lambda: {"a": [{"x": 1}]}, "column 'a'.*dict"),

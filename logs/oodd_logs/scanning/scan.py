@@ -24,7 +24,7 @@ from oodd_eval.data.baseline import Baseline
 from oodd_eval.data.bounded import without_nan
 from oodd_eval.data.facts import roles_of
 from oodd_eval.data.trajectory import Trajectory
-from oodd_eval.errors import ContractError, OoddError, TrajectoryError, UnknownNameError, UsageError
+from oodd_eval.errors import ContractError, OoddError, UnknownNameError, UsageError
 from oodd_eval.metrics.alarms import AlarmKind, GuaranteedAlarm, joined, numbered, window_weights
 from oodd_eval.metrics.cusum import Standardization
 from oodd_eval.metrics.faults import StreamScale
@@ -461,10 +461,7 @@ def _as_episode(episode: Episode | ArrayLike, number: int) -> Episode:
     if isinstance(episode, Episode):
         return episode if episode.recording is not None else replace(episode, recording=number)
     name = f"episode {number}"
-    try:
-        rows = as_numbers(episode)
-    except TrajectoryError as error:
-        raise UsageError(f"{name}: {error}") from error
+    rows = as_numbers(episode, f"{name}: ")
     if rows.ndim != 2 or 0 in rows.shape:
         raise UsageError(f"{name} has shape {rows.shape}, expected (rows, sensors)")
     return Episode(name, name, rows, np.empty((len(rows) - 1, 0)), None, recording=number)
