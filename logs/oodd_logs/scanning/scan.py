@@ -231,7 +231,7 @@ class Scan:
             With None in place of what is undefined or infinite.
         """
         return {
-            "schema": "oodd-eval/scan/1",
+            "schema": "oodd-eval/scan/2",
             "judge": self.judge,
             "fdr": self.fdr,
             "sensors": list(self.sensors),
