@@ -49,6 +49,27 @@ def test_the_page_shows_what_its_commands_print_and_finds_the_slip(session, caps
         assert not {"auc_matched", "auc"} & {*record["metrics"]}  # which need twins
 
 
+def test_the_page_shows_what_becomes_of_spoilt_files(session, capsys):
+    exec(SCRIPT, {})  # noqa: S102
+    logs = session.directory / "logs"
+    texts = {path.name: path.read_text() for path in logs.glob("run-*.csv")}
+    lines = [line.split(",") for line in texts["run-6.csv"].splitlines()]
+    lines[61][3], lines[71][2] = "#N/A", "ERR 7"
+    texts["run-6.csv"] = "".join(",".join(line) + "\n" for line in lines)
+    texts["run-4.csv"] = texts["run-4.csv"].replace("lift[rad]", "Lift")
+    texts["run-8.csv"] = texts["run-8.csv"][:-30]
+    texts["run-9.csv"] = texts["run-9.csv"].replace("torque[N m]", "torque[kN m]")
+    texts["run-14.csv"] = ""
+    for name, text in texts.items():
+        (logs / name).write_text(text)
+    assert session.run(COMMANDS[0]) == 0
+    printed = " ".join(capsys.readouterr().out.split())
+    block = re.search(r"```text\n(ledger .*?)```", SECTION, re.DOTALL)[1]
+    for entry in re.split(r"^ledger", block, flags=re.MULTILINE)[1:]:
+        assert " ".join(entry.split()) in printed
+    assert session.run(COMMANDS[1]) == 0  # of the draft, which leaves spoilt files out
+
+
 def test_a_scan_names_the_gap_and_with_a_watchdog_the_slips(session):
     """Where loads slip for certain: the episodes of all six logs, and the gap of the third."""
     assert "torque -= 0.5 * fault" in SCRIPT
