@@ -70,6 +70,7 @@ def test_the_page_shows_what_becomes_of_spoilt_files(session, capsys):
     assert session.run(COMMANDS[1]) == 0  # of the draft, which leaves spoilt files out
 
 
+@pytest.mark.filterwarnings("ignore::oodd_eval.errors.PromiseWarning")  # of few recordings
 def test_a_scan_names_the_gap_and_with_a_watchdog_the_slips(session):
     """Where loads slip for certain: the episodes of all six logs, and the gap of the third."""
     assert "torque -= 0.5 * fault" in SCRIPT

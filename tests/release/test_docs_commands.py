@@ -222,6 +222,7 @@ def test_commands_of_a_page_do_what_it_says(path, tmp_path, monkeypatch, capsys,
         assert code == int(fails), f"{line}\nexit code {code}\n{printed.out}{printed.err}"
 
 
+@pytest.mark.filterwarnings("ignore::oodd_eval.errors.PromiseWarning")  # of few recordings
 @pytest.mark.parametrize("path", [p for p in WITH_PYTHON if name(p) not in FRAGMENTS], ids=name)
 def test_python_of_a_page_runs(path, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
