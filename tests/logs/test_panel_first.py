@@ -52,7 +52,7 @@ def test_ten_episodes_are_enough_for_a_scan(seed):
     [odd] = scan_episodes(logs, sensors=SENSORS).odd
     assert (odd.episode.name, odd.suspects[0]) == ("episode 4", "joint 5")
     assert odd.alarms[:60].sum() <= 2
-    assert odd.alarms[63:].all()
+    assert odd.alarms[66:].all()
 
 
 @pytest.mark.parametrize(

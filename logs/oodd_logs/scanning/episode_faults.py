@@ -14,11 +14,14 @@ from oodd_eval.data.baseline import Baseline
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.metrics.faults import FAR, StreamLimits, StreamScale, readings
 from oodd_logs.episodes import Episode
+from oodd_logs.ledger import Ledger
 from oodd_logs.scanning.limits import SHORTEST
 from oodd_logs.scanning.outliers import ODD_SHARE
 
 Floats = NDArray[np.float64]
 
+_END_ROWS: Final = 3  # at the end without a reading that are the logger's end
+_END_SHARE: Final = 0.02  # of an episode that is, too
 _STEPS: Final = 3.0  # usual steps that a gap is longer than, at least
 
 
@@ -31,8 +34,9 @@ class EpisodeFault:
     what
         A sensor, ``"observation"`` for all at once, ``"action"`` or ``"time"``.
     fault
-        ``"missing"``, ``"frozen"``, ``"saturated"``, ``"out of range"``, ``"repeated"`` or
-        ``"gap"``, which makes no episode odd.
+        ``"missing"``, ``"broken"`` (a number that is no measurement), ``"frozen"``,
+        ``"saturated"``, ``"out of range"``, ``"repeated"`` or ``"gap"``. A gap makes no episode
+        odd, and a sensor that stays at an end of its range does not by itself.
     row
         The row with which it began or, for a gap, the first one after it.
     """
@@ -48,10 +52,38 @@ class EpisodeFault:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CleanedEpisode:
-    """An episode for detectors, and its readings minus usual values, NaN where there is none."""
+    """An episode for detectors, and its readings minus an offset, NaN where there is none.
+
+    Rows as they were recorded, and where a number in them is broken, stand beside.
+    """
 
     trajectory: Trajectory
     observations: NDArray[np.float32]
+    offset: Floats
+    recorded: Floats
+    broken: NDArray[np.bool_]
+
+    def rows(self, judged: NDArray[Any] | None) -> Floats:
+        """Return the rows in units of the logs, as they are judged, and broken numbers."""
+        if judged is None:
+            return self.recorded
+        return np.where(self.broken, self.recorded, judged + self.offset)
+
+    def faults(self, names: Sequence[str]) -> list[EpisodeFault]:
+        """Return the first broken number of each sensor."""
+        first = self.broken.argmax(axis=0)
+        columns = np.flatnonzero(self.broken.any(axis=0)).tolist()
+        return [EpisodeFault(names[d], "broken", int(first[d])) for d in columns]
+
+    def account(self, ledger: Ledger, source: str, names: Sequence[str]) -> None:
+        """Say which numbers are broken, and are held for detectors."""
+        for fault, count in zip(
+            self.faults(names), filter(None, self.broken.sum(axis=0)), strict=True
+        ):
+            value = self.recorded[fault.row, names.index(fault.what)]
+            reason = "a broken number, beyond a million deviations"
+            where = {"name": fault.what, "source": source, "row": fault.row}
+            ledger.add("cell", "held", reason, count=int(count), cell=f"{value:g}", **where)
 
 
 def clean(episodes: Sequence[Episode]) -> list[CleanedEpisode]:
@@ -63,8 +95,15 @@ def clean(episodes: Sequence[Episode]) -> list[CleanedEpisode]:
     for episode in episodes:
         rows = episode.observations - offset
         held = _held(rows, spread), _held(episode.actions, commanded)
-        read = np.where(_is_good(rows, spread), rows, np.nan).astype(np.float32)
-        cleaned.append(CleanedEpisode(Trajectory(*(x.astype(np.float32) for x in held)), read))
+        good = _is_good(rows, spread)
+        broken = ~good & ~np.isnan(rows)
+        read = np.where(good | _is_end(rows), held[0], np.nan).astype(np.float32)
+        recorded = episode.observations
+        cleaned.append(
+            CleanedEpisode(
+                Trajectory(*(x.astype(np.float32) for x in held)), read, offset, recorded, broken
+            )
+        )
     return cleaned
 
 
@@ -87,6 +126,15 @@ def _is_good(rows: Floats, spread: Floats) -> NDArray[np.bool_]:
         near = np.abs(rows) < np.minimum(FAR * spread, np.finfo(np.float32).max)
     good: NDArray[np.bool_] = np.isfinite(rows) & near
     return good
+
+
+def _is_end(rows: Floats) -> NDArray[np.bool_]:
+    """Return which cells are empty as the logger ended: few rows, and no number behind them."""
+    empty = np.isnan(rows)
+    run = np.where(empty.all(axis=0), 0, empty[::-1].argmin(axis=0))
+    few = run <= max(_END_ROWS, _END_SHARE * len(rows))
+    ended: NDArray[np.bool_] = (np.arange(len(rows), 0, -1)[:, None] <= run) & few
+    return ended
 
 
 def _held(rows: Floats, spread: Floats) -> Floats:

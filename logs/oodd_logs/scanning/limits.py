@@ -4,7 +4,7 @@ from typing import Final
 
 SHORTEST: Final = 2
 """Rows of the shortest episode that is judged."""
-FITS: Final = 20
-"""Most fits: more episodes than this are judged in as many groups, each by a fit on the others."""
+FITS: Final = 5
+"""Fits of each of the two passes: each judges episodes that it has not seen."""
 WINDOWS: Final = 40
 """Windows that a single recording is cut into."""

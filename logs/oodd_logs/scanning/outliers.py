@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
 
@@ -26,6 +26,7 @@ ENOUGH: Final = 20
 ODD_SHARE: Final = 0.2
 """Share of the others that may be odd, too, without a word in the tail: the largest of them."""
 _ROUNDING: Final = 1e-9  # of an episode
+_MOST: Final = 300.0  # surprise up to which statistics are told apart
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,26 +90,26 @@ class Tail:
         share = (n + 1 - below) / (n + 1)
         return cls(start, share, tuple(estimates)) if estimates else None
 
-    def p(self, largest: float) -> float:
-        """Return the chance that a nominal episode's largest statistic is at least this.
+    def surprise(self, largest: ArrayLike) -> Floats:
+        """Return ``-log p`` of values: how rarely a nominal episode's largest one is as large.
 
         Parameters
         ----------
         largest
-            The statistic.
+            Statistics.
 
         Returns
         -------
-        float
-            1 up to the median.
+        float64 array
+            0 up to the median.
         """
-        if largest <= self.start:
-            return 1.0
-        amount = float(np.cbrt(largest) - np.cbrt(self.start))
-        logs = (-r * math.log1p(amount / mean / r) for mean, r in self.estimates)
-        return min(1.0, len(self.estimates) * self.share * math.exp(min(logs)))
+        values = np.asarray(largest, np.float64)
+        amounts = np.maximum(np.cbrt(values) - np.cbrt(self.start), 0.0)
+        logs = [r * np.log1p(amounts / mean / r) for mean, r in self.estimates]
+        best = np.max(logs, axis=0) - math.log(len(self.estimates) * self.share)
+        return np.where(values > self.start, np.maximum(best, 0.0), 0.0)
 
-    def value(self, surprise: Floats) -> Floats:
+    def value(self, surprise: ArrayLike) -> Floats:
         """Return the statistics with such a ``-log p``, minus infinity up to the median.
 
         Parameters
@@ -120,26 +121,35 @@ class Tail:
         -------
         float64 array
         """
-        values = np.full(surprise.shape, -np.inf)
-        for i in np.argwhere(surprise > -math.log(self.share)):
-            values[*i] = self.threshold(math.exp(-surprise[*i]))
-        return values
+        values = np.asarray(surprise, np.float64)
+        logs = np.clip(values + math.log(len(self.estimates) * self.share), 0.0, _MOST)
+        amounts = [mean * r * np.expm1(logs / r) for mean, r in self.estimates]
+        roots = np.cbrt(self.start) + np.min(amounts, axis=0)
+        return np.where(values > -math.log(self.share), roots**3, -np.inf)
 
-    def threshold(self, p: float) -> float:
-        """Return the statistic beyond the median that has a p-value.
 
-        Parameters
-        ----------
-        p
-            The p-value, above 0.
+def surprise(value: float, others: Floats, weights: Floats | None = None) -> float:
+    """Return ``-log p`` of a value: from the tail beyond the others' median, else from its rank.
 
-        Returns
-        -------
-        float
-        """
-        ratio = len(self.estimates) * self.share / p
-        amount = min(mean * r * math.expm1(math.log(ratio) / r) for mean, r in self.estimates)
-        return float((np.cbrt(self.start) + max(amount, 0.0)) ** 3)
+    >>> round(math.exp(-surprise(3.0, np.array([1.0, 2.0, 3.0]))), 3)
+    0.5
+    """
+    tail = Tail.fit(others, weights)
+    if tail is None or value <= tail.start:
+        return -math.log(rank_p(value, others, weights))
+    return float(tail.surprise(value))
+
+
+def mean_beyond(others: Floats) -> float:
+    """Return by how much values exceed their median, the largest fifth of all censored.
+
+    Surprises of nominal episodes, which fall off exponentially, do so by 1.
+    """
+    ordered = np.sort(others)
+    n, middle = len(ordered), (len(ordered) + 1) // 2
+    seen = max(1, math.floor((1 - ODD_SHARE) * n) - middle)
+    above = ordered[middle:] - ordered[middle - 1]
+    return float(np.minimum(above, above[seen - 1 : seen].max(initial=0.0)).sum() / seen)
 
 
 def rank_p(largest: float, others: Floats, weights: Floats | None = None) -> float:

@@ -1,40 +1,34 @@
 """Find the odd ones among recorded episodes, with their odd rows and sensors.
 
-Each episode is judged by a detector that was fitted on others, and its largest statistic by theirs.
-Faults of the stream, such as frozen sensors, count as the statistic that would be as rare.
+Each episode is judged by fits that have not seen it, in two passes: the second one leaves out the
+fifth that the first one found most suspicious. Faults of the stream and figures of whole episodes
+count beside the detector's statistic, by how rare they are.
 """
 
-import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from fnmatch import fnmatchcase
-from multiprocessing import get_context
-from typing import Any, Final, Literal, NamedTuple, cast
+from functools import cached_property
+from typing import Any, Final, Literal, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from oodd_live.handle import DetectorHandle, has_actions
+from oodd_live.handle import has_actions
 from oodd_live.nominal import sensor_names
 from oodd_live.watchdog import Watchdog
 
 from oodd_eval.arrays import as_numbers
-from oodd_eval.data.baseline import Baseline
 from oodd_eval.data.bounded import without_nan
 from oodd_eval.data.facts import roles_of
-from oodd_eval.data.trajectory import Trajectory
-from oodd_eval.errors import ContractError, OoddError, UnknownNameError, UsageError
-from oodd_eval.metrics.alarms import AlarmKind, GuaranteedAlarm, joined, numbered, window_weights
+from oodd_eval.errors import UnknownNameError, UsageError
+from oodd_eval.metrics.alarms import AlarmKind, GuaranteedAlarm, window_weights
 from oodd_eval.metrics.cusum import Standardization
-from oodd_eval.metrics.faults import StreamScale
 from oodd_eval.names import counted
 from oodd_eval.plugins.contract import AnyDetector
-from oodd_eval.plugins.explanations import ExplainingDetector, Explanation, checked_explanation
 from oodd_logs.episodes import EVERY, Episode
 from oodd_logs.frames import scanned_frames
 from oodd_logs.ledger import Ledger
-from oodd_logs.marks import runs_of
 from oodd_logs.scanning.episode_faults import (
     CleanedEpisode,
     EpisodeFault,
@@ -43,6 +37,9 @@ from oodd_logs.scanning.episode_faults import (
     gaps,
     stream_scale,
 )
+from oodd_logs.scanning.evidence import SCORE, Evidence, Finding, Peers, Readings, surprises
+from oodd_logs.scanning.figures import compare_figures
+from oodd_logs.scanning.fits import Fit, thinned
 from oodd_logs.scanning.limits import FITS, SHORTEST, WINDOWS
 from oodd_logs.scanning.outliers import (
     ENOUGH,
@@ -53,7 +50,9 @@ from oodd_logs.scanning.outliers import (
     q_values,
     rank_p,
     rank_threshold,
+    surprise,
 )
+from oodd_logs.scanning.watched import watched
 
 Floats = NDArray[np.float64]
 
@@ -246,12 +245,11 @@ class Scan:
 
 SCANNER: Final = "panel"
 """Detector that scans where none is named."""
-_QUICK: Final = {"forecast": "linear"}  # of it: networks would be fitted 20 times
+_QUICK: Final = {"forecast": "linear"}  # of it: networks would be fitted ten times
 
 _FEW: Final = 0.001  # p-value of faults that are shown where episodes are too few to be odd
-
-Outcome = tuple[Floats, Explanation | None]
-"""Answer of a detector about one episode: scores, and an explanation if it gives any."""
+_ROWS: Final = 50_000  # of all episodes, from which on the first pass takes every so many
+_GLANCE: Final = 10_000  # rows of the first ranking of all
 
 
 def scan_episodes(
@@ -336,7 +334,7 @@ def scan_episodes(
     """
     if not 0 < fdr < 1:
         raise UsageError(f"fdr={fdr!r}, expected a share between 0 and 1")
-    ledger = ledger or Ledger()
+    ledger = Ledger() if ledger is None else ledger
     recorded, sensors = _recorded(episodes, sensors, ledger)
     widths = sorted({episode.observations.shape[1] for episode in recorded})
     if len(widths) != 1:
@@ -350,38 +348,38 @@ def scan_episodes(
         notes.append(f"Left out: {counted(count, 'episode(s)')} of fewer than {shortest} rows.")
     if not usable:
         raise UsageError(f"no episode of at least {shortest} rows: nothing to judge")
-    triage = fine, first, ledger
+    confirmed = _confirmed(usable, fine)
     if watchdog is not None:
-        return _scan_with(watchdog, usable, names, fdr, notes, triage)
+        evidence = watched(watchdog, usable, names)
+        comparison = _by_calibration(evidence, watchdog, confirmed, fdr)
+        terms = _Terms("a watchdog", fdr, first, notes, ledger, confirmed)
+        notes.insert(
+            0, f"{counted(len(usable), 'episode(s)')}, judged by a watchdog: {watchdog.promise}."
+        )
+        return _verdict(evidence, watchdog.sensors, comparison, terms)
     if len(usable) < SHORTEST:
         rows = len(usable[0].observations)
         raise UsageError(
             f"a single episode of {rows} rows cannot be judged by others: record more, cut it into "
-            f"windows (--window, window=) of {max(SHORTEST, rows // FITS)} rows, say, or judge it "
-            "by a saved watchdog"
+            f"windows (--window, window=) of {max(SHORTEST, rows // ENOUGH)} rows, say, or judge "
+            "it by a saved watchdog"
         )
     cleaned = clean(usable)
-    defaults = _QUICK if detector == SCANNER else {}
-    trajectories = [episode.trajectory for episode in cleaned]
-    arguments = {**defaults, **(parameters or {})}
-    actions = has_actions(trajectories)
-    fit = _Fit(detector, seed, horizon, arguments, baseline, roles, actions)
+    arguments = {**(_QUICK if detector == SCANNER else {}), **(parameters or {})}
+    actions = has_actions([episode.trajectory for episode in cleaned])
+    fit = Fit(detector, seed, horizon, arguments, baseline, roles, actions)
     handle = fit.handle()
-    folds = [range(k, len(usable), FITS) for k in range(min(FITS, len(usable)))]
-    training = [[x for i, x in enumerate(trajectories) if i not in fold] for fold in folds]
-    left_out = [[trajectories[i] for i in fold] for fold in folds]
-    if jobs == 1:
-        answers = [*map(fit.judge, training, left_out)]
-    else:
-        with ProcessPoolExecutor(min(jobs, len(folds)), get_context("spawn")) as pool:
-            answers = [*pool.map(fit.judge, training, left_out)]
-    numbers = itertools.chain(*folds)
-    outcomes = dict(zip(numbers, itertools.chain(*answers), strict=True))
-    scores = [outcomes[i][0] for i in range(len(usable))]
-    judged = _with_faults(usable, cleaned, handle.alarm, scores, baseline)
-    judged = [replace(one, explanation=outcomes[i][1]) for i, one in enumerate(judged)]
-    how = "each episode is judged by a fit that has not seen it."
-    notes.insert(0, f"{counted(len(usable), 'episode(s)')}, {counted(len(folds), 'fit(s)')}: {how}")
+    name = handle.state["name"] or type(handle.detector).__name__
+    terms = _Terms(f"{name}, fitted on the other episodes", fdr, first, notes, ledger, confirmed)
+    passes = _Passes(usable, cleaned, fit, handle.alarm, jobs, progress)
+    evidence = passes.evidence(names, first)
+    for scanned, episode in zip(cleaned, usable, strict=True):
+        scanned.account(ledger, episode.source, names)
+    fits = f"{min(FITS, len(usable))} fits"
+    if len(usable) >= ENOUGH:
+        fits = f"two passes of {FITS} fits"
+    how = "each episode is judged by fits that have not seen it."
+    notes.insert(0, f"{counted(len(usable), 'episode(s)')}, {fits}: {how}")
     recordings = len({episode.recording for episode in usable})
     if recordings < min(len(usable), LEAST):
         windows = f"{len(usable)} windows of {counted(recordings, 'recording(s)')}"
@@ -389,60 +387,26 @@ def scan_episodes(
             f"{windows}: they are judged as if each were a recording, and no false discovery rate "
             f"is kept; {LEAST} recordings would do."
         )
-    name = handle.state["name"] or type(handle.detector).__name__
-    terms = _Terms(f"{name}, fitted on the other episodes", fdr, notes)
-    scan = _banded(_verdict(judged, names, terms), *triage)
+    scan = _verdict(evidence, names, _by_others(evidence, passes.peers, confirmed, fdr), terms)
     if progress is not None:
-        progress("judged", [scanned.episode.name for scanned in scan.ranked])
+        progress("judged by both passes", [one.episode.name for one in scan.ranked])
     return scan
 
 
-def _banded(scan: Scan, fine: Sequence[str], first: int, ledger: Ledger) -> Scan:
-    """Return the scan with bands, places and reasons."""
-
-    def oddness(scanned: ScannedEpisode) -> tuple[float, float]:
-        return math.inf if math.isnan(scanned.p) else scanned.p, -scanned.largest
-
-    places = {id(s): k for k, s in enumerate(sorted(scan.episodes, key=oddness), 1)}
-    mixed = len(scan.odd) > ODD_SHARE * len(scan.episodes) and len(scan.episodes) >= LEAST
-    episodes = []
-    for scanned in scan.episodes:
-        confirmed = any(fnmatchcase(scanned.episode.name, pattern) for pattern in fine)
-        odd, place = scanned.odd and not (mixed or confirmed), places[id(scanned)]
-        band: Band = "surely" if odd else "fine"
-        if not odd and not confirmed and (place <= first or scanned.odd):
-            band = "look at"
-        clauses = [f"{f.fault} {f.what} from row {f.row}" for f in scanned.faults]
-        clauses += [f"{name} from row {scanned.since}" for name in scanned.suspects[:1]]
-        clauses += [f"a statistic of {scanned.largest:.3g}"]
-        episodes.append(replace(scanned, odd=odd, band=band, place=place, reason=clauses[0]))
-    return replace(scan, episodes=episodes, ledger=ledger, kinds_mixed=mixed)
-
-
-def _with_faults(
-    episodes: Sequence[Episode],
-    cleaned: Sequence[CleanedEpisode],
-    kind: AlarmKind,
-    scores: Sequence[Floats],
-    baseline: int,
-) -> "list[_Judged]":
-    """Join the statistics of scores and faults of the stream, each scaled on the other episodes."""
-    statistics = [_statistic(kind, scores, _peers(episodes, i), i) for i in range(len(episodes))]
-    largest = np.array([np.nanmax(statistic, initial=-math.inf) for statistic in statistics])
-    scale, read = stream_scale(cleaned, baseline)
-    breaks = breaks_of(episodes)
-    usual = float(np.quantile(breaks, 1 - ODD_SHARE, method="nearest"))
-    judged = []
-    for i, (episode, statistic) in enumerate(zip(episodes, statistics, strict=True)):
-        # Either may take one half of what is odd by chance.
-        surprise = np.maximum(scale.surprise(*read[i]) - math.log(2), 0.0)
-        tail = Tail.fit(*_reference(largest, episodes, i))
-        joint = statistic if tail is None else joined(statistic, tail.value(surprise))
-        readings = _Readings(scale, ~(joint <= statistic), *read[i])
-        pauses = tuple(gaps(episode.time, float(breaks[i]), usual))
-        rest = cleaned[i].trajectory, baseline, readings
-        judged.append(_Judged(episode, scores[i], joint, None, pauses, *rest))
-    return judged
+def _confirmed(episodes: Sequence[Episode], fine: Sequence[str]) -> list[int]:
+    """Return the numbers of episodes that are named as fine."""
+    numbers: set[int] = set()
+    for pattern in fine:
+        found = {
+            i
+            for i, name in enumerate(episode.name for episode in episodes)
+            # A recording stands for its windows.
+            if pattern in {name, name.partition("[")[0]} or fnmatchcase(name, pattern)
+        }
+        if not found:
+            raise UnknownNameError("episode", pattern, [episode.name for episode in episodes])
+        numbers |= found
+    return sorted(numbers)
 
 
 def _recorded(
@@ -497,336 +461,264 @@ def _rows(episode: Episode, start: int, stop: int) -> Episode:
     )
 
 
-def _scan_with(
-    watchdog: Watchdog,
-    episodes: list[Episode],
-    names: list[str],
-    fdr: float,
-    notes: list[str],
-    triage: tuple[Sequence[str], int, Ledger],
-) -> Scan:
-    """Let a watchdog judge all episodes, row by row as beside a robot."""
-    unknown = [name for name in watchdog.sensors if name not in names]
-    if unknown:
-        raise UnknownNameError("sensor of the logs", unknown[0], names)
-    order = [names.index(name) for name in watchdog.sensors]
-    episodes = [
-        replace(episode, observations=episode.observations[:, order]) for episode in episodes
-    ]
-    breaks = breaks_of(episodes)
-    judged = [
-        _watched(watchdog.copy(), episode, float(longest), rows.trajectory)
-        for episode, longest, rows in zip(episodes, breaks, clean(episodes), strict=True)
-    ]
-    notes.insert(
-        0, f"{counted(len(episodes), 'episode(s)')}, judged by a watchdog: {watchdog.promise}."
-    )
-    terms = _Terms("a watchdog", fdr, notes, watchdog.rule.threshold)
-    if (calibration := watchdog.calibration) is not None:
-        reference = _Reference.of(np.array(calibration.largest), np.array(calibration.recordings))
-        windows = reference.units > len({*calibration.recordings})
-        enough = (reference.units + 1) * fdr >= len(episodes) and not windows
-        terms = replace(terms, reference=reference, exact=enough and not calibration.rolling)
-    return _banded(_verdict(judged, watchdog.sensors, terms), *triage)
+@dataclass(frozen=True, eq=False)
+class _Passes:
+    """Two passes of fits over episodes."""
 
+    episodes: Sequence[Episode]
+    cleaned: Sequence[CleanedEpisode]
+    fit: Fit
+    kind: AlarmKind
+    jobs: int
+    progress: Progress | None
 
-def _watched(
-    watchdog: Watchdog, episode: Episode, longest: float, trajectory: Trajectory
-) -> "_Judged":
-    rows, sensors = episode.observations.shape
-    scores, statistic = np.full((2, rows), np.nan)
-    shares, onsets = np.full((rows, sensors), np.nan), np.full(rows, -1)
-    faults: dict[tuple[str, str], int] = {}
-    actions = [None, *episode.actions] if episode.actions.shape[1] else [None] * rows
-    times = [None] * rows
-    if episode.time is not None and watchdog.settings.rate is not None:
-        times = episode.time.tolist()
-    for t, (row, action) in enumerate(zip(episode.observations, actions, strict=True)):
-        reading = watchdog.update(row, action, times[t])
-        scores[t], statistic[t] = reading.score, reading.statistic
-        if reading.onset is not None:
-            onsets[t] = reading.onset
-            shares[t] = [reading.sensors.get(name, 0.0) for name in watchdog.sensors]
-        for key in reading.faults.items():
-            faults.setdefault(key, t)
-    seen = *(EpisodeFault(*key, t) for key, t in faults.items()), *gaps(episode.time, longest)
-    return _Judged(episode, scores, statistic, Explanation(shares, onsets), seen, trajectory)
+    @cached_property
+    def peers(self) -> list[Peers]:
+        """What each episode is compared with."""
+        everything = range(len(self.episodes))
+        return [Peers.of(self.episodes, i, everything) for i in everything]
 
-
-@dataclass(frozen=True, slots=True)
-class _Fit:
-    """A function that makes a detector for one fit."""
-
-    detector: AnyDetector
-    seed: int
-    horizon: int
-    parameters: Mapping[str, Any]
-    baseline: int
-    roles: tuple[str, ...]
-    actions: bool
-
-    def handle(self) -> DetectorHandle:
-        """Return a new detector."""
-        return DetectorHandle.make(
-            self.detector,
-            None,
-            self.seed,
-            self.horizon,
-            self.parameters,
-            self.baseline,
-            self.roles,
-            actions=self.actions,
-        )
-
-    def judge(
-        self, training: Sequence[Trajectory], episodes: Sequence[Trajectory]
-    ) -> list[Outcome]:
-        """Fit on training episodes and judge others."""
-        handle = self.handle()
-        detector = handle.detector
-        base = Baseline.fit(training, self.baseline) if self.baseline else None
-        hidden = 0 if handle.adapts else self.baseline
-        try:
-            detector.fit([handle.visible(x, base) for x in training])
-            outcomes: list[Outcome] = []
-            for x in episodes:
-                scores, explanation = handle.scores(x, base), None
-                if isinstance(detector, ExplainingDetector):
-                    visible = handle.visible(x, base)
-                    shares, onsets = checked_explanation(detector.explain(visible), visible)
-                    shares = np.pad(shares, ((hidden, 0), (0, 0)), constant_values=np.nan)
-                    onsets = np.where(onsets < 0, -1, onsets + hidden)
-                    onsets = np.pad(onsets, (hidden, 0), constant_values=-1)
-                    explanation = Explanation(shares, onsets)
-                outcomes.append((scores, explanation))
-        except OoddError:
-            raise
-        except Exception as error:
-            name = type(detector).__name__
-            failure = f"detector {name} raised {type(error).__name__}: {error}"
-            raise ContractError(f"{failure} (fitted on {len(training)} episodes)") from error
-        return outcomes
-
-
-class _Readings(NamedTuple):
-    """Readings of an episode, and where their faults are rarer than its score."""
-
-    scale: StreamScale
-    decides: NDArray[np.bool_]
-    rows: NDArray[Any]
-    judged: NDArray[Any] | None
-
-    def faults(self, surprise: float, names: Sequence[str]) -> list[EpisodeFault]:
-        """Return those that are at least as surprising."""
-        named = self.scale.faults(self.rows, self.judged, surprise + math.log(2))
+    def evidence(self, names: Sequence[str], first: int) -> list[Evidence]:
+        """Judge the episodes, and explain the first of the ranking."""
+        count, trajectories = len(self.episodes), [x.trajectory for x in self.cleaned]
+        scale, seen = stream_scale(self.cleaned, self.fit.baseline)
+        readings = [Readings.of(scale, *read) for read in seen]
+        stream = [reading.surprise for reading in readings]
+        rows = [x.rows(judged) for x, (_, judged) in zip(self.cleaned, seen, strict=True)]
+        figures = compare_figures(rows, [episode.task for episode in self.episodes])
+        beside = np.array([x.max() for x in stream]), np.array([x.distance for x in figures])
+        if self.progress is not None:
+            self._ranked(_GLANCE, 2, beside)
+        apart, explained = [], range(count)
+        if count >= ENOUGH:
+            ranked = self._ranked(_ROWS, FITS, beside)
+            # Of fewer, fits need all: what they lack makes nominal ones odder than it hides.
+            apart, explained = ranked[: math.floor(ODD_SHARE * count)], ranked[:first]
+        outcomes = self.fit.cross(trajectories, apart, [*apart, *explained], jobs=self.jobs)
+        statistics = self._statistics([scores for scores, _ in outcomes])
+        breaks = breaks_of(self.episodes)
+        usual = float(np.quantile(breaks, 1 - ODD_SHARE, method="nearest"))
         return [
-            EpisodeFault(names[d] if d >= 0 else "observation", fault, row)
-            for d, fault, row in named
+            Evidence(
+                episode,
+                outcomes[i][0],
+                statistics[i],
+                outcomes[i][1],
+                (*self.cleaned[i].faults(names), *gaps(episode.time, float(breaks[i]), usual)),
+                trajectories[i],
+                self.fit.baseline,
+                readings[i],
+                stream[i],
+                figures[i],
+            )
+            for i, episode in enumerate(self.episodes)
         ]
 
+    def _ranked(self, most: int, folds: int, beside: tuple[Floats, Floats]) -> list[int]:
+        """Rank episodes by cross-fits on at most so many rows of all, the oddest first."""
+        trajectories = [x.trajectory for x in self.cleaned]
+        if (step := math.ceil(sum(map(len, trajectories)) / most)) > 1:
+            trajectories = [thinned(x, step) for x in trajectories]
+        outcomes = self.fit.thinned(step).cross(trajectories, folds=folds, jobs=self.jobs)
+        statistics = self._statistics([scores for scores, _ in outcomes])
+        largest = np.array([np.nanmax(x, initial=-math.inf) for x in statistics])
+        order = np.lexsort((-largest, -surprises(largest, *beside, self.peers).max(axis=1)))
+        words = f"ranked by {counted(folds, 'fit(s)')}"
+        if self.progress is not None:
+            self.progress(words, [self.episodes[i].name for i in order])
+        return [int(i) for i in order]
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Judged:
-    """One episode with what a detector and the stream say about it."""
-
-    # Of the trajectory the first `baseline` rows are what readings are compared with.
-
-    episode: Episode
-    scores: Floats
-    statistic: Floats
-    explanation: Explanation | None
-    faults: tuple[EpisodeFault, ...]
-    trajectory: Trajectory
-    baseline: int = 0
-    readings: _Readings | None = None
-
-    @property
-    def evidence(self) -> Floats:
-        """Readings and their steps, (2, R, D), for what a detector does not explain."""
-        rows = self.trajectory.observations.astype(np.float64)
-        if self.baseline:
-            rows -= rows[: self.baseline].mean(axis=0)
-        return np.stack([rows, np.diff(rows, axis=0, prepend=rows[:1])])
-
-    @property
-    def sums(self) -> Floats:
-        """Number, sum and sum of squares of readings and of steps, (3, 2, D)."""
-        evidence = self.evidence
-        sums: Floats = np.stack([np.ones_like(evidence), evidence, evidence**2]).sum(axis=2)
-        return sums
+    def _statistics(self, scores: Sequence[Floats]) -> list[Floats]:
+        """Return the statistics of the episodes' scores."""
+        if self.kind == "score":
+            return [GuaranteedAlarm(None, math.inf).statistic(x) for x in scores]
+        # A CUSUM standardizes them with the median of its peers' means and of their deviations,
+        # which no odd episode among them spoils.
+        fitted = [Standardization.fit([x]) for x in scores]
+        pairs = np.array([(x.mean, x.std) for x in fitted])
+        alarms = [
+            GuaranteedAlarm(Standardization(*map(float, np.nanmedian(pairs[i], axis=0))), math.inf)
+            for i in (others.numbers for others in self.peers)
+        ]
+        return [alarm.statistic(x) for alarm, x in zip(alarms, scores, strict=True)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Terms:
-    """Comparison of statistics: with those of `reference`, by default of the other episodes."""
-
-    # If `exact`, these are enough for p-values by rank. Where they are too few for any, what is
-    # above the limit is odd.
+    """What a verdict is made by."""
 
     judge: str
     fdr: float
+    first: int
     notes: list[str]
+    ledger: Ledger
+    fine: Sequence[int]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Comparison:
+    """Comparison of episodes with one another, with those that are confirmed, or with others."""
+
+    # Surprises of score, stream and figures, (N, 3); ranks among what they are compared with, the
+    # fewest of these, and whether they are kept apart; if exact, ranks are the p-values. The
+    # statistic with a p-value, which depends on the episode.
+
+    surprises: Floats
+    tails: Sequence[Tail | None]
+    ranks: Floats
+    units: int
+    is_apart: bool
+    exact: bool
+    threshold: Callable[[int, float], float]
+    above_fine: Sequence[bool]
     limit: float = math.nan
-    reference: "_Reference | None" = None
-    exact: bool = False
 
 
-class _Reference(NamedTuple):
-    """Largest statistics that one is compared with, and their weights: see `window_weights`."""
+def _by_calibration(
+    evidence: Sequence[Evidence], watchdog: Watchdog, fine: Sequence[int], fdr: float
+) -> _Comparison:
+    """Compare with a watchdog's calibration episodes, or with its threshold alone."""
+    calibration, largest = watchdog.calibration, np.array([one.largest for one in evidence])
+    limit, count = watchdog.rule.threshold, len(evidence)
+    if calibration is None:
+        found = np.column_stack([np.zeros(count), *[np.full(count, -math.inf)] * 2])
+        nothing: tuple[list[None], Floats] = [None] * count, np.full(count, math.nan)
+        apart = True, False, lambda *_: limit, [False] * count
+        return _Comparison(found, *nothing, 0, *apart, limit)
+    numbers = np.array(calibration.recordings)
+    recordings = len({*numbers.tolist()})
+    # Windows count where recordings are too few.
+    weights = window_weights(numbers if recordings + 1 >= LEAST else np.arange(len(numbers)))
+    reference = np.array(calibration.largest), weights
+    units, tail = round(float(weights.sum())), Tail.fit(*reference)
+    exact = (units + 1) * fdr >= count - len(fine) and units <= recordings
+    exact &= not calibration.rolling
 
-    largest: Floats
-    weights: Floats
+    def threshold(_: int, needed: float) -> float:
+        if exact:
+            return rank_threshold(math.exp(-needed), *reference)
+        return math.nan if tail is None else float(tail.value(needed))
 
-    @classmethod
-    def of(cls, largest: Floats, numbers: NDArray[np.intp]) -> "_Reference":
-        """Let windows of a recording count once, unless recordings are too few to judge by."""
-        is_enough = len({*numbers.tolist()}) + 1 >= LEAST
-        return cls(largest, window_weights(numbers) if is_enough else np.ones(len(largest)))
-
-    @property
-    def units(self) -> int:
-        """Number of recordings, or of windows that count as such."""
-        return round(float(self.weights.sum()))
+    score = np.array([surprise(x, *reference) for x in largest.tolist()])
+    ranks = np.array([rank_p(x, *reference) for x in largest.tolist()])
+    found = np.column_stack([score, *[np.full(count, -math.inf)] * 2])
+    apart = True, exact, threshold, [False] * count
+    return _Comparison(found, [tail] * count, ranks, units, *apart, limit)
 
 
-def _verdict(judged: Sequence[_Judged], names: Sequence[str], terms: _Terms) -> Scan:
-    """Compare the episodes' largest statistics, and look for rows and sensors."""
-    episodes = [judgement.episode for judgement in judged]
-    largest = np.array([np.nanmax(judgement.statistic, initial=-math.inf) for judgement in judged])
-    references = [terms.reference] * len(episodes) if terms.reference else []
-    for i in range(len(episodes) if terms.reference is None else 0):
-        references.append(_reference(largest, episodes, i))
-    tails = [Tail.fit(*reference) for reference in references]
-    ranks = np.array(
-        [rank_p(x, *reference) for x, reference in zip(largest, references, strict=True)]
-    )
-    p = ranks.copy()
-    for i, tail in enumerate(tails):
-        if tail is not None and largest[i] > tail.start and not terms.exact:
-            p[i] = tail.p(largest[i])
-    fewest = min(reference.units for reference in references) + 1
-    notes, has_p_values = [*terms.notes], fewest >= LEAST
-    if not has_p_values:
-        p[:] = math.nan
-        deciding = "nothing decides"
-        if terms.limit > 0:
-            deciding = "the watchdog's threshold decides"
-        notes.append(
-            f"{fewest} episodes are too few to judge one by the others, which takes {LEAST} and "
-            f"works well from {ENOUGH} on: here {deciding}. Record more, or cut long ones "
-            "(window)."
-        )
-    elif terms.exact:
-        notes.append(
-            f"The {fewest - 1} calibration episodes are enough for p-values by rank, which keep "
-            "the false discovery rate whatever the distribution."
-        )
-    q = q_values(p) if has_p_values else p
-    critical = critical_p(p, terms.fdr) if has_p_values else math.nan
-    surprising = -math.log(critical if has_p_values else _FEW)
-    sums = np.stack([judgement.sums for judgement in judged])
+def _by_others(
+    evidence: Sequence[Evidence], peers: Sequence[Peers], fine: Sequence[int], fdr: float
+) -> _Comparison:
+    """Compare episodes with the others, or with those that are confirmed if these are enough."""
+    episodes, count = [one.episode for one in evidence], len(evidence)
+    reference, exact = peers, False
+    if is_apart := len({episodes[i].recording for i in fine}) >= LEAST:
+        reference = [Peers.of(episodes, i, fine) for i in range(count)]
+        units = min(others.units for others in reference)
+        exact = (units + 1) * fdr >= count - len(fine)
+    largest = np.array([one.largest for one in evidence])
+    stream = np.array([one.stream.max() for one in evidence])
+    distances = np.array([one.figure.distance if one.figure else 0.0 for one in evidence])
+    # Ranks are exact where all are compared alike.
+    compared = peers if exact else reference
+    found = surprises(largest, stream, distances, compared)
+    best = found.max(axis=1)
+    tails = [Tail.fit(largest[x.numbers], x.weights) for x in compared]
+    ranks = [rank_p(x, best[y.numbers], y.weights) for x, y in zip(best, reference, strict=True)]
+
+    def threshold(i: int, needed: float) -> float:
+        others, tail = reference[i], tails[i]
+        if exact:
+            p = math.exp(-needed)
+            needed = rank_threshold(p, best[others.numbers], others.weights)
+        return math.nan if tail is None else float(tail.value(needed - SCORE))
+
+    above = [
+        is_apart and bool(x > best[y.numbers].max()) for x, y in zip(best, reference, strict=True)
+    ]
+    units = min(others.units for others in reference)
+    return _Comparison(found, tails, np.array(ranks), units, is_apart, exact, threshold, above)
+
+
+def _verdict(
+    evidence: Sequence[Evidence], names: Sequence[str], comparison: _Comparison, terms: _Terms
+) -> Scan:
+    """Call episodes odd, rank all, and look for rows and sensors."""
+    count, fine, fdr = len(evidence), {*terms.fine}, terms.fdr
+    largest, best = np.array([x.largest for x in evidence]), comparison.surprises.max(axis=1)
+    tested = np.array([i not in fine for i in range(count)])
+    p = comparison.ranks if comparison.exact else np.minimum(np.exp(-best), 1.0)
+    q, critical = np.full(count, math.nan), math.nan
+    has_p_values, above_limit = comparison.units + 1 >= LEAST, largest > comparison.limit
+    if has_p_values and tested.any():
+        q[tested], critical = q_values(p[tested]), critical_p(p[tested], fdr)
+    elif not has_p_values:
+        p = q
+    called = q <= fdr
+    mixed = not comparison.is_apart and bool(called.sum() > ODD_SHARE * tested.sum())
+    notes = [*terms.notes, *_remarks(comparison, int(called.sum()) if mixed else 0, len(fine))]
+    order = np.lexsort((-largest, -best, ~tested)).tolist()
+    places = {i: place for place, i in enumerate(order, 1)}
+    needed = -math.log(critical if critical > 0 else _FEW)
+    sums = np.stack([one.sums for one in evidence])
     scanned = []
-    for i, judgement in enumerate(judged):
-        tail, threshold = tails[i], terms.limit
-        if has_p_values:
-            threshold = math.nan if tail is None else tail.threshold(critical)
-            if terms.exact:
-                threshold = rank_threshold(critical, *references[i])
-        rejected = bool(q[i] <= terms.fdr if has_p_values else largest[i] > terms.limit)
-        # Rounding of the threshold may leave nothing but the largest statistic.
-        above = runs_of(rejected & (judgement.statistic >= np.fmin(threshold, largest[i])))
-        faults = judgement.faults
-        if judgement.readings is not None:
-            faults = (*judgement.readings.faults(surprising, names), *faults)
-        row = since = None
-        shares: dict[str, float] = {}
-        if rejected:
-            row = above[0][0]
-            other_sums = np.delete(sums, i, axis=0).sum(axis=0)
-            usual = -math.inf if tail is None else tail.start
-            since, values = _blame(judgement, usual, above[0], other_sums)
-            if judgement.readings is not None and judgement.readings.decides[row]:
-                since, values = _faulty(faults, names, row, (since, values))
-            order = np.argsort(-values, kind="stable").tolist()
-            shares = {names[d]: float(values[d]) for d in order}
+    for i, one in enumerate(evidence):
+        odd, suspicious = bool(called[i]) and not mixed, bool(called[i]) or comparison.above_fine[i]
+        band: Band = "surely" if odd else "fine"
+        if not odd and tested[i] and (places[i] <= terms.first or suspicious or above_limit[i]):
+            band = "look at"
+        found, tail = comparison.surprises[i], comparison.tails[i]
+        threshold = comparison.threshold(i, needed) if has_p_values else comparison.limit
+        joint = one.joint(tail, float(found[1]))
+        faults = one.listed(needed, names)
+        limits = threshold if odd else math.inf, -math.inf if tail is None else tail.start
+        finding = one.finding(found, joint, limits, sums.sum(axis=0) - sums[i], faults, names)
+        shown = finding if band != "fine" else Finding(None, None, (), {}, finding.reason)
+        as_rare = -math.inf
+        if tail is not None and math.isfinite(found[2]):
+            as_rare = float(tail.value(found[2] - SCORE))
         scanned.append(
             ScannedEpisode(
-                judgement.episode,
-                judgement.scores,
-                judgement.statistic,
-                float(largest[i]),
-                float(ranks[i]),
+                one.episode,
+                one.scores,
+                joint,
+                float(np.nanmax(np.append(joint, as_rare), initial=-math.inf)),
+                float(comparison.ranks[i]),
                 float(p[i]),
                 float(q[i]),
                 threshold,
-                rejected,
-                row,
-                since,
-                tuple(above),
-                shares,
+                odd,
+                shown.row,
+                shown.since,
+                shown.intervals,
+                shown.sensors,
                 faults,
+                band,
+                places[i],
+                finding.reason,
             )
         )
-    return Scan(scanned, names, terms.judge, terms.fdr, notes)
+    return Scan(scanned, names, terms.judge, fdr, notes, terms.ledger, mixed)
 
 
-def _faulty(
-    faults: Sequence[EpisodeFault], names: Sequence[str], row: int, blamed: tuple[int, Floats]
-) -> tuple[int, Floats]:
-    """Return since when faults last, and equal shares of faulty sensors; else what is blamed."""
-    causes = [fault for fault in faults if fault.fault != "gap" and fault.row <= row]
-    if not causes:
-        return blamed
-    faulty = np.array([float(name in {fault.what for fault in causes}) for name in names])
-    shares = faulty / faulty.sum() if faulty.any() else blamed[1]
-    return min(fault.row for fault in causes), shares
-
-
-def _peers(episodes: Sequence[Episode], i: int) -> list[int]:
-    """Return what an episode is compared with: others of its task where these suffice, else all."""
-    candidates = [j for j in range(len(episodes)) if j != i]
-    same = [j for j in candidates if episodes[j].task == episodes[i].task]
-    return same if len(same) + 1 >= LEAST else candidates
-
-
-def _reference(largest: Floats, episodes: Sequence[Episode], i: int) -> _Reference:
-    """Return the peers' statistics: of other recordings where these suffice, else of windows."""
-    peers = _peers(episodes, i)
-    others = [j for j in peers if episodes[j].recording != episodes[i].recording]
-    numbers = numbered([episodes[j].recording for j in others], len(others))
-    if len({*numbers.tolist()}) + 1 < LEAST:
-        others, numbers = peers, np.arange(len(peers))
-    return _Reference.of(largest[others], numbers)
-
-
-def _statistic(kind: AlarmKind, scores: Sequence[Floats], peers: Sequence[int], i: int) -> Floats:
-    """Return the statistic of an episode's scores."""
-    # A CUSUM standardizes them with the median of its peers' means and of their deviations, which
-    # no odd episode among them spoils.
-    standardization = None
-    if kind == "cusum":
-        standardizations = (Standardization.fit([scores[j]]) for j in peers)
-        mean, std = np.nanmedian([[s.mean, s.std] for s in standardizations], axis=0)
-        standardization = Standardization(float(mean), float(std))
-    return GuaranteedAlarm(standardization, math.inf).statistic(scores[i])
-
-
-def _blame(
-    judged: _Judged, usual: float, interval: tuple[int, int], other_sums: Floats
-) -> tuple[int, Floats]:
-    """Return the row with which an excursion began, and the share of each sensor in it, (D,)."""
-    # It is above the threshold in the interval; before it the statistic was above what is usual.
-    row, stop = interval
-    if judged.explanation is not None and judged.explanation.onsets[row] >= 0:
-        return int(judged.explanation.onsets[row]), judged.explanation.shares[row]
-    quiet = np.flatnonzero(judged.statistic[:row] <= usual)
-    since = int(quiet[-1]) + 1 if len(quiet) else 0
-    n, total, squares = other_sums[:, :, None]
-    # A single episode has no others.
-    mean = total / np.maximum(n, 1.0)
-    std = np.sqrt(np.maximum(squares / np.maximum(n, 1.0) - mean**2, 0.0))
-    least = 1e-6 * np.maximum(1.0, np.abs(mean))
-    # Readings, or their steps if these are farther from those of the others.
-    deviations = (np.abs(judged.evidence - mean) / np.maximum(std, least)).max(axis=0)
-    of_excursion = (deviations[since:stop] ** 2).mean(axis=0)
-    return since, of_excursion / (of_excursion.sum() or 1.0)
+def _remarks(comparison: _Comparison, mixed: int, fine: int) -> Iterator[str]:
+    """Yield what is to be known about a comparison."""
+    fewest = comparison.units + 1
+    if fewest < LEAST:
+        limited = math.isfinite(comparison.limit)
+        deciding = "the watchdog's threshold says which to look at" if limited else "none is called"
+        yield (
+            f"{fewest} episodes are too few to judge one by the others, which takes {LEAST} and "
+            f"works well from {ENOUGH} on: {deciding}. Record more, or cut long ones (window)."
+        )
+    elif comparison.exact:
+        whose = "confirmed" if fine else "calibration"
+        yield (
+            f"The {fewest - 1} {whose} episodes are enough for p-values by rank, which keep "
+            "the false discovery rate whatever the distribution."
+        )
+    if mixed:
+        yield (
+            f"{mixed} episodes stand out, more than a fifth: these episodes are of several kinds, "
+            "and none is sure. Scan one kind at a time, or name some that are fine (--fine)."
+        )
