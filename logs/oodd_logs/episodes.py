@@ -681,13 +681,8 @@ def _cut(
             takes_short = reading.every or not (NOMINAL_ROLES & {*parts} or (parts and not inside))
             source = recorded.label
             if stop - start < length and not takes_short:
-                reading.ledger.add(
-                    "row",
-                    "dropped",
-                    "at ends of recordings, less than a window",
-                    count=stop - start,
-                    source=source,
-                )
+                reason, count = "at ends of recordings, less than a window", stop - start
+                reading.ledger.add("row", "dropped", reason, count=count, source=source)
             elif stop - start < reading.shortest:
                 if not (is_piece or reading.every):
                     raise _too_short(reading, recorded.recording, stop - start)
@@ -987,15 +982,9 @@ def _say_far(source: EpisodeSource) -> None:
         for facts in every if largest[d] + abs(centre) > most else []:
             column = source.rows(facts, 0, facts.rows)[:, d]
             for row in np.flatnonzero(np.abs(column - centre) > most).tolist():
-                source.ledger.add(
-                    "cell",
-                    "kept",
-                    "no measurement by its size",
-                    name=sensor.name,
-                    source=facts.name,
-                    row=row,
-                    cell=f"{column[row]:g}",
-                )
+                place: dict[str, Any] = {"source": facts.name, "cell": f"{column[row]:g}"}
+                reason, name = "no measurement by its size", sensor.name
+                source.ledger.add("cell", "kept", reason, name=name, row=row, **place)
 
 
 def _settle_columns(source: EpisodeSource, recipe: Recipe) -> None:

@@ -1,6 +1,8 @@
 """Facts of one recording by its recipe: values that hold for all of it, stamps, anomalous rows."""
 
+import contextlib
 import dataclasses
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -11,7 +13,7 @@ from numpy.typing import NDArray
 from oodd_eval.data.parts import CALIBRATION, TRAIN, TWINS
 from oodd_eval.errors import TrajectoryError, UnknownNameError, UsageError
 from oodd_logs.kinds.times import orders_of, parse_times, past_midnight, unit_in
-from oodd_logs.ledger import Fate, Item, Ledger
+from oodd_logs.ledger import Fate, Ledger
 from oodd_logs.marks import IntervalList, LabelValues, Mark, anomalous_cells, runs_of
 from oodd_logs.readers.cells import mixed
 from oodd_logs.readers.packed import stem
@@ -186,7 +188,7 @@ class StampedRows:
                     raise
             lacking = np.flatnonzero(~np.isfinite(times))
             cell = str(cells[lacking[0]]) if len(lacking) and cells.dtype.kind == "U" else ""
-            self._say("dropped", "without a stamp", lacking, cell, column.column)
+            self._say("dropped", "without a stamp", lacking, cell=cell, name=column.column)
             is_clock = cells.dtype.kind == "U" and len(self._selection.times[topic]) == 1
             stamps += past_midnight(times) if is_clock else times
         missing = ~np.isfinite(stamps)
@@ -197,21 +199,22 @@ class StampedRows:
             )
         return stamps
 
-    def _say(
-        self,
-        fate: Fate,
-        reason: str,
-        rows: NDArray[Any],
-        cell: str = "",
-        name: str = "",
-        item: Item = "row",
-    ) -> None:
-        """Add rows by their numbers to the ledger, with the text in the first."""
+    def _say(self, fate: Fate, reason: str, rows: NDArray[Any], **more: Any) -> None:
+        """Add rows by their numbers to the ledger, with their first."""
         if len(rows):
-            row, count, source = int(rows[0]), len(rows), self._recorded.label
-            self._ledger.add(
-                item, fate, reason, name=name, count=count, source=source, row=row, cell=cell
-            )
+            more |= {"count": len(rows), "row": int(rows[0]), "source": self._recorded.label}
+            self._ledger.add(more.pop("item", "row"), fate, reason, **more)
+
+    @contextlib.contextmanager
+    def _scan_goes_on(self, kind: str = "") -> Iterator[None]:
+        """Leave out marks that a recording does not have where it is scanned."""
+        try:
+            yield
+        except (TrajectoryError, UsageError) as error:
+            if self._recipe.missing != "keep":
+                raise
+            reason = str(error).removeprefix(f"{self._recorded.source}: ")
+            self._ledger.add("mark", "dropped", reason, name=kind, source=self._recorded.label)
 
     def _order(self, cells: Column) -> str:
         """Return the order of day and month in dates, empty where it is not told."""
@@ -327,22 +330,12 @@ class StampedRows:
             ]
         name, is_cut = recorded.recording.name, recorded.recording.name != stem(recorded.path)
         is_cut = is_cut and bool(recipe.episode)
-        try:
-            rows = intervals.of_recording(recorded.path, name, recorded.relative, is_cut=is_cut)
-        except UsageError:
-            if recipe.missing != "keep":
-                raise
-            rows = []
-            reason = "names a file that is cut into episodes, not one of these"
-            self._ledger.add("mark", "dropped", reason, source=recorded.label)
-        for _, first, stop, kind in rows:
-            try:
-                marks.append(self._listed(first, stop, kind and anomaly_name(kind)))
-            except (TrajectoryError, UsageError) as error:
-                if recipe.missing != "keep":  # a scan goes on
-                    raise
-                reason = str(error).removeprefix(f"{recorded.source}: ")
-                self._ledger.add("mark", "dropped", reason, name=kind, source=recorded.label)
+        with self._scan_goes_on():
+            for _, first, stop, kind in intervals.of_recording(
+                recorded.path, name, recorded.relative, is_cut=is_cut
+            ):
+                with self._scan_goes_on(kind):
+                    marks.append(self._listed(first, stop, kind and anomaly_name(kind)))
         tables = {name: recipe.anomalous[name] for name in recorded.kinds}
         onsets = [(table.onset, table.stop, name) for name, table in tables.items()]
         onset = recorded.recording.fields.get("onset")
@@ -361,10 +354,11 @@ class StampedRows:
         if not present.any():
             return cells
         if 2 * absent.sum() < len(cells):
-            self._say("held", "no label", start + np.flatnonzero(absent), "", name, "cell")
+            self._say("held", "no label", start + np.flatnonzero(absent), name=name, item="cell")
         if 2 * is_text.sum() < len(cells):
             cell, rows = str(cells[is_text.argmax()]), start + np.flatnonzero(is_text)
-            self._say("kept", "a label that is text among numbers", rows, cell, name, "cell")
+            reason = "a label that is text among numbers"
+            self._say("kept", reason, rows, cell=cell, name=name, item="cell")
         return cells if is_text.any() else numbers
 
     def _listed(self, start: Any, stop: Any, kind: str) -> Mark:

@@ -8,6 +8,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, Final, cast
 
 import numpy as np
@@ -18,7 +19,7 @@ from oodd_eval.errors import OutputError, TrajectoryError, UsageError
 from oodd_logs.kinds import Conversion, Matrix, kinds_by_key
 from oodd_logs.kinds.angles import FULL_TURN
 from oodd_logs.kinds.naming import matching
-from oodd_logs.ledger import Fate, Item, Ledger
+from oodd_logs.ledger import Ledger
 from oodd_logs.readers.cells import mixed
 from oodd_logs.recipe import Recipe
 from oodd_logs.recording import Column, Recording, Topic
@@ -64,7 +65,7 @@ class TopicRows:
         ledger: Ledger,
         label: str,
     ) -> None:
-        self._topic, self._source, self._label = recording.topics[name], recording.source, label
+        self._topic, self._source = recording.topics[name], recording.source
         self._count = self._topic.rows
         rewards = (selection.reward,) if selection.reward else ()
         columns = (*selection.sensors, *selection.actions, *rewards)
@@ -73,7 +74,8 @@ class TopicRows:
         self._unique = list(dict.fromkeys(self._columns))
         # What a last action led to was not recorded: it may be missing.
         self._may_end = np.array([i >= len(selection.sensors) for i in self.indices], bool)
-        self._policy, self._most, self._ledger = recipe.missing, recipe.missing_rows, ledger
+        self._policy, self._most = recipe.missing, recipe.missing_rows
+        self._say = partial(ledger.add, source=label)
         self._position = 0
         self._last = np.full(len(self._columns), np.nan)
         self._runs = np.zeros(len(self._columns), np.int64)
@@ -113,7 +115,7 @@ class TopicRows:
         if self._policy != "drop":
             first = self._position = int(firsts.max(initial=0))
             late = self._columns[int(firsts.argmax())] if first else ""
-            self._say("row", "dropped", "before the first value", late, first, 0)
+            self._say("row", "dropped", "before the first value", name=late, count=first, row=0)
             last = self._count - (self._ending() if self._policy == "keep" else 0)
             return np.arange(first, last)
         dropped = np.diff(kept) - 1
@@ -121,7 +123,7 @@ class TopicRows:
             row = int(kept[int(dropped.argmax())]) + 1
             raise self._too_long(row, "", int(dropped.max()))
         count, row = self._count - len(kept), int(complete.argmin())
-        self._say("row", "dropped", "missing values", "", count, row)
+        self._say("row", "dropped", "missing values", count=count, row=row)
         return kept
 
     def _ending(self) -> int:
@@ -132,7 +134,8 @@ class TopicRows:
         ends[self._may_end & (ends == 1)] = 0
         count = int(ends.max(initial=0))
         names = ", ".join(n for n, end in zip(self._columns, ends, strict=True) if end)
-        self._say("row", "dropped", "last ones without a value", names, count, self._count - count)
+        reason, row = "last ones without a value", self._count - count
+        self._say("row", "dropped", reason, name=names, count=count, row=row)
         return count
 
     def rows(self, numbers: NDArray[np.int64]) -> Matrix:
@@ -189,7 +192,8 @@ class TopicRows:
                         f"expected a finite number{self._shares.get(name, '')}: missing = 'hold' "
                         "or 'drop' in a recipe says what to do"
                     )
-                self._say("cell", "held", reason, name, int(which.sum()), start + row, cell)
+                place: dict[str, Any] = {"row": start + row, "cell": cell}
+                self._say("cell", "held", reason, name=name, count=int(which.sum()), **place)
             if self._policy == "keep":
                 continue
             held = np.maximum.accumulate(np.where(bad, -1, numbers))
@@ -200,13 +204,6 @@ class TopicRows:
             cells[:, j] = np.where(held < 0, self._last[j], cells[np.maximum(held, 0), j])
             self._runs[j] = runs[-1]
         self._runs[~missing[-1]] = 0
-
-    def _say(
-        self, item: Item, fate: Fate, reason: str, name: str, count: int, row: int, cell: str = ""
-    ) -> None:
-        self._ledger.add(
-            item, fate, reason, name=name, count=count, source=self._label, row=row, cell=cell
-        )
 
     def _too_long(self, row: int, column: str, rows: int) -> TrajectoryError:
         problem = f"column {column!r} is missing" if column else "values are missing"
