@@ -279,7 +279,8 @@ def _read(reading: "_Reading", recordings: Iterable[Recorded]) -> EpisodeSource:
                 with _scan_goes_on(reading, recorded.label):
                     _add(reading, recorded)
             else:
-                reading.ledger.add("file", "dropped", "no rows", source=recorded.label)
+                item: Item = "file" if recorded.label == recorded.relative else "recording"
+                reading.ledger.add(item, "dropped", "no rows", source=recorded.label)
         return _in_parts(reading)
     except BaseException:
         if reading.first:
@@ -290,7 +291,7 @@ def _read(reading: "_Reading", recordings: Iterable[Recorded]) -> EpisodeSource:
 @contextlib.contextmanager
 def _scan_goes_on(reading: "_Reading", label: str, item: Item = "recording") -> Iterator[None]:
     """Leave out what cannot be read, where every other episode is to be read."""
-    episodes = reading.parts.get(EVERY, [])
+    episodes = reading.parts.setdefault(EVERY, []) if reading.every else []
     count = len(episodes)
     try:
         yield
@@ -861,7 +862,7 @@ def _in_parts(reading: _Reading) -> EpisodeSource:
 
 
 def _source(reading: _Reading, parts: dict[str, list[EpisodeFacts]]) -> EpisodeSource:
-    if reading.first is None or not parts:
+    if reading.first is None or not any(parts.values()):
         for failure in reading.failures:
             raise failure
         raise UsageError("there are no episodes to read, expected at least one")

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import json
+import shutil
 import unicodedata
 from dataclasses import dataclass, field
 
@@ -12,11 +13,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from oodd_logs.episodes import read_episodes
-from oodd_logs.importing import import_frames
+from oodd_logs.importing import import_frames, import_recipe
+from oodd_logs.ledger import Ledger
 from oodd_logs.recipe import Recipe
 from oodd_logs.scanning.logs import read_logs
 from oodd_logs.scanning.scan import scan_episodes
 
+from oodd_eval.cli.main import main
 from oodd_eval.errors import OoddError
 
 FILES, ROWS, FAULTY = 30, 60, range(24, 30)
@@ -350,6 +353,25 @@ def test_intervals_that_mark_nothing_are_refused_and_a_scan_says_them(row, words
     for told in (str(raised.value), "\n".join(read.notes)):
         assert all(word in told for word in words)
     assert len(read.episodes) == 2 * FILES
+
+
+def test_a_split_keeps_what_became_of_its_logs_outside_its_digest(clean, tmp_path, capsys):
+    folder, _ = clean["csv"]
+    logs_of_it = shutil.copytree(folder, tmp_path / "logs")
+    (logs_of_it / "r30.csv").touch()
+    ledger = Ledger()
+    whole = import_recipe(RECIPE, folder, tmp_path / "whole")
+    split = import_recipe(RECIPE, logs_of_it, tmp_path / "split", ledger=ledger)
+    assert split.digest == whole.digest
+    line = "dropped: 1 file, no rows: r30.csv"
+    assert line in split.manifest["environments"]["spoilt"]["ledger"]
+    assert [entry["examples"] for entry in ledger.as_json()] == [["r30.csv"]]
+    assert main(["data", "info", str(split.path)]) == 0
+    run = ["run", "--detector", "range", "--split", str(split.path), "--output", str(tmp_path)]
+    assert main([*run, "--env", "spoilt"]) == 0
+    assert " ".join(capsys.readouterr().out.split()).count(line) == 2
+    record = json.loads((tmp_path / "records.jsonl").read_text().splitlines()[0])
+    assert line in record["provenance"]["logs"]
 
 
 # In memory
