@@ -154,10 +154,9 @@ def table_of(episodes: Sequence[ScannedEpisode]) -> tuple[list[str], list[list[s
 def summary(scan: Scan) -> str:
     """Return how many episodes are in each band, in a sentence."""
     bands = [scanned.band for scanned in scan.episodes]
-    verb = "is" if 1 in (len(scan.odd), len(bands)) else "are"
     return (
-        f"{len(scan.odd)} of {counted(len(bands), 'episode(s)')} {verb} odd (false discovery rate "
-        f"{scan.fdr:g}); {bands.count('look at')} to look at; {bands.count('fine')} fine."
+        f"{len(scan.odd)} of {len(bands)} episodes are odd (false discovery rate {scan.fdr:g}); "
+        f"{bands.count('look at')} to look at; {bands.count('fine')} fine."
     )
 
 
