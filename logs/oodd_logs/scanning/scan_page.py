@@ -13,7 +13,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.names import counted
 from oodd_logs.marks import runs_of
 from oodd_logs.scanning.scan import Scan, ScannedEpisode
 
