@@ -983,9 +983,9 @@ def _say_far(source: EpisodeSource) -> None:
         for facts in every if largest[d] + abs(centre) > most else []:
             column = source.rows(facts, 0, facts.rows)[:, d]
             for row in np.flatnonzero(np.abs(column - centre) > most).tolist():
-                place: dict[str, Any] = {"source": facts.name, "cell": f"{column[row]:g}"}
+                entry: dict[str, Any] = {"source": facts.name, "cell": f"{column[row]:g}"}
                 reason, name = "no measurement by its size", sensor.name
-                source.ledger.add("cell", "kept", reason, name=name, row=row, **place)
+                source.ledger.add("cell", "kept", reason, name=name, row=row, **entry)
 
 
 def _settle_columns(source: EpisodeSource, recipe: Recipe) -> None:

@@ -192,8 +192,8 @@ class TopicRows:
                         f"expected a finite number{self._shares.get(name, '')}: missing = 'hold' "
                         "or 'drop' in a recipe says what to do"
                     )
-                place: dict[str, Any] = {"row": start + row, "cell": cell}
-                self._say("cell", "held", reason, name=name, count=int(which.sum()), **place)
+                entry: dict[str, Any] = {"row": start + row, "cell": cell}
+                self._say("cell", "held", reason, name=name, count=int(which.sum()), **entry)
             if self._policy == "keep":
                 continue
             held = np.maximum.accumulate(np.where(bad, -1, numbers))
