@@ -33,7 +33,7 @@ from oodd_logs.readers import readers
 DIFFERENT, ROWS, COLUMNS = 20, 5000, 8
 WIDE, WINDOW = 20, 600
 READING, IMPORTING = 1.0, 1.8  # of the plain loop's seconds
-INSPECTING = 22.0  # of the seconds of json.loads
+INSPECTING = 25.0  # of the seconds of json.loads
 FILES_MB, RECORDING_MB = 500, 1000
 
 IMPORT = """

@@ -267,3 +267,21 @@ def test_a_column_that_one_file_lacks_is_a_sensor_and_the_file_left_out(tmp_path
     assert (len(files), "r03.csv" in files) == (11, False)
     assert any("r03.csv" in entry.sources for entry in logs.ledger)
     import_recipe(recipe, tmp_path, tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("code", "every", "recognised"),
+    [(-999, 1, True), (65535, 2, True), (9999, 12, False), (12.5, 1, False)],
+)
+def test_a_code_for_missing_values_is_told_by_several_files(tmp_path, code, every, recognised):
+    def columns(rng, rows, i):
+        signal = np.sin(rows / 9).round(4)
+        signal[40:43] = code if i % every == 0 else signal[40:43]
+        return {"t": rows / 10, "x": signal}
+
+    _, recipe = logs_of(tmp_path, columns, files=12)
+    assert recipe.columns.get("missing_codes") == ({"x": (code,)} if recognised else None)
+    with read_episodes(recipe, tmp_path) as source:
+        column = [quantity.name for quantity in source.sensors].index("x")
+        largest = max(e.observations[:, column].max() for e in source.episodes("train"))
+    assert (largest > 5) == (code > 0 and not recognised)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from oodd_eval.data.offsets import RunningMoments, is_coarse
 from oodd_eval.errors import TrajectoryError
+from oodd_logs.kinds.missing_codes import NUMBERS
 from oodd_logs.kinds.times import SCALES, orders_of, parse_times, past_midnight, unit_in
 from oodd_logs.ledger import Fate
 from oodd_logs.marks import runs_of
@@ -90,6 +91,9 @@ class ColumnFacts:
         Range, mean and spread of the numbers.
     values
         Cells by value, None where there are more than `FEW` values.
+    codes, inner
+        By numbers that often stand for a missing value, their cells by recording, and the range of
+        all other numbers.
     steps, falls, rises
         Number of differences between neighbouring rows, and of those below and above zero.
     span
@@ -113,6 +117,8 @@ class ColumnFacts:
     exceptions: dict[tuple[str, str], tuple[int, int, str]] = field(default_factory=dict)
     numbers: RunningMoments = field(default_factory=RunningMoments)
     values: Counter[float | str] | None = field(default_factory=Counter)
+    codes: dict[float, Counter[str]] = field(default_factory=dict)
+    inner: tuple[float, float] = (math.inf, -math.inf)
     steps: int = 0
     falls: int = 0
     rises: int = 0
@@ -169,6 +175,7 @@ class ColumnFacts:
             return
         self._count_values(numbers, ~absent)
         self.numbers.add(present)
+        self._count_codes(present, numbers)
         self.filled |= np.logical_or.reduceat(~absent, self.firsts)
         inside = np.diff(np.searchsorted(self.firsts, np.flatnonzero(~absent), side="right")) == 0
         if self._count_steps(present, inside if len(self.sources) > 1 else None):
@@ -191,6 +198,18 @@ class ColumnFacts:
         recordings = np.searchsorted(self.firsts, cells, side="right") - 1
         for i in np.unique(recordings).tolist():
             yield i, cells[recordings == i]
+
+    def _count_codes(self, present: NDArray[np.float64], numbers: NDArray[np.float64]) -> None:
+        """Count cells that may stand for a missing value, and keep the range of the others."""
+        low, high = float(present.min()), float(present.max())
+        if not NUMBERS.isdisjoint((low, high)):
+            coded = np.isin(numbers, [*NUMBERS])
+            for i, rows in self._by_recording(np.flatnonzero(coded)):
+                for code in numbers[rows].tolist():
+                    self.codes.setdefault(code, Counter())[self.sources[i]] += 1
+            others = numbers[np.isfinite(numbers) & ~coded]
+            low, high = others.min(initial=math.inf), others.max(initial=-math.inf)
+        self.inner = min(self.inner[0], float(low)), max(self.inner[1], float(high))
 
     def _count_missing(self, absent: NDArray[np.bool_]) -> None:
         if not absent.any():

@@ -153,7 +153,7 @@ def _draft_columns(logs: Inspection) -> Iterator[str]:
         elif used:
             yield from wrapper.wrap(f"{name}: {listed([n for names in used for n in names], 40)}")
     facts = {name: logs.columns[name] for name in sensors}
-    if any(lacks_values(name, facts[name]) for name in sensors):
+    if "missing-code" in logs.kinds or any(lacks_values(n, facts[n]) for n in sensors):
         most = max(max(column.longest, column.leading) for column in facts.values())
         yield 'missing = "hold"  # the last value; or "drop" rows, or "refuse"'
         if most > MISSING_ROWS:

@@ -17,6 +17,8 @@ PIXELS: Final = 4096
 
 def _flatten(_name: str, value: Any) -> Iterable[tuple[str, Any]] | None:
     """Return nothing in place of bytes; None for all else."""
+    if isinstance(value, dict):
+        return None
     if isinstance(value, str):
         return () if len(value) > LONGEST_TEXT else None
     if isinstance(value, bytes | bytearray | memoryview):

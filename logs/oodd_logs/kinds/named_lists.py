@@ -77,7 +77,7 @@ def _is_list(value: Any) -> bool:
 
 def _are_names(value: Any) -> bool:
     """Tell whether a value is a list of different texts."""
-    if not isinstance(value, list | tuple) or not value:
+    if not isinstance(value, list | tuple) or not value or not isinstance(value[0], str):
         return False
     return all(isinstance(text, str) and text for text in value) and len({*value}) == len(value)
 

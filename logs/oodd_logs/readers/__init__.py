@@ -99,8 +99,8 @@ class Reader:
         path
             The file or directory.
         options
-            Those of `options` that a recipe sets; ``missing_codes``, numbers and texts that stand
-            for missing values, in every format.
+            Those of `options` that a recipe sets, and ``missing_codes`` as it has them, in every
+            format.
 
         Yields
         ------
@@ -117,7 +117,7 @@ class Reader:
             When the content cannot be read. Reading rows raises it, too.
         """
         options = dict(options)
-        codes = missing_codes.check(missing_codes.KEY, options.pop(missing_codes.KEY, []))
+        codes = missing_codes.check(missing_codes.KEY, options.pop(missing_codes.KEY, ()))
         check_known(f"option of the format {self.name}", self.options, *options)
         if not path.exists():
             raise UsageError(f"{str(path)!r} does not exist, expected {self.part}")

@@ -2,10 +2,11 @@
 
 import contextlib
 import dataclasses
+import fnmatch
 import functools
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -199,32 +200,47 @@ def _unique(names: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(unique)
 
 
-def without_codes(recording: Recording, codes: Sequence[float | str]) -> Recording:
+def without_codes(recording: Recording, codes: Mapping[str, Sequence[float | str]]) -> Recording:
     """Return a recording in which cells with one of some numbers or texts are missing.
 
     A column whose other cells are numbers is one of numbers then.
+
+    Parameters
+    ----------
+    recording
+        The recording.
+    codes
+        Numbers and texts by globs of columns, with or without their topic and unit.
     """
-    topics = {name: _without(topic, codes) for name, topic in recording.topics.items()}
+    topics = {name: _without(name, topic, codes) for name, topic in recording.topics.items()}
+    for glob, named in codes.items():
+        reason = f"cells with {', '.join(map(str, named))} count as missing"
+        recording.ledger.add("column", "changed", reason, name=glob)
     return dataclasses.replace(recording, topics=topics)
 
 
-def _without(topic: Topic, codes: Sequence[float | str]) -> Topic:
-    figures = [float(code) for code in codes if not isinstance(code, str)]
-    words = [*{code.strip() for code in codes if isinstance(code, str)}, *map(str, codes)]
+def _without(topic_name: str, topic: Topic, codes: Mapping[str, Sequence[float | str]]) -> Topic:
     worded: dict[str, bool] = {}
 
-    def plain(cells: Column) -> Column:
+    def codes_of(name: str) -> list[float | str]:
+        labels = [name, f"{topic_name}.{name}", name.partition("[")[0].rpartition(":")[2]]
+        globs = [glob for glob in codes if fnmatch.filter(labels, glob)]
+        return [code for glob in globs for code in codes[glob]]
+
+    def plain(name: str, cells: Column) -> Column:
+        named = codes_of(name)
         if cells.dtype.kind == "U":
-            return np.where(np.isin(cells, words), "", cells)
+            return np.where(np.isin(cells, [str(code).strip() for code in named]), "", cells)
+        figures = [code for code in named if not isinstance(code, str)]
         return np.where(np.isin(cells, figures), np.nan, cells)
 
     def read(names: Sequence[str], start: int, stop: int) -> dict[str, Column]:
         columns = {}
         for name, cells in topic.read(names, start, stop).items():
-            columns[name] = plain(cells)
+            columns[name] = plain(name, cells)
             if columns[name].dtype.kind == "U":
                 if name not in worded:  # for all of its rows, whatever this range has
-                    every = plain(topic.read([name], 0, topic.rows)[name])
+                    every = plain(name, topic.read([name], 0, topic.rows)[name])
                     worded[name] = numbers(every.tolist(), "") is None
                 column = None if worded[name] else numbers(columns[name].tolist(), "")
                 columns[name] = columns[name] if column is None else column
