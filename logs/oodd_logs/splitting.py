@@ -9,7 +9,7 @@ import dataclasses
 import functools
 import itertools
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal, Self
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from oodd_eval.data.bounded import EPISODE
 from oodd_eval.errors import UnknownNameError, UsageError
 from oodd_logs.ledger import Ledger
+from oodd_logs.marks import plain_label
 from oodd_logs.readers import reader_for
 from oodd_logs.recipe import Recipe
 from oodd_logs.recording import MISSING, Column, Recording, Topic
@@ -50,9 +51,8 @@ COUNTS: Final = re.compile(
 
 _STEADY: Final = 0.9  # share of the rows in which a counter rises
 _BLOCK: Final = 1 << 16  # rows of a large table that are read at once
-_NO_VALUE: Final = (*MISSING, "inf")
+_NO_VALUE: Final = MISSING | {"inf"}
 
-_Kind = Literal["key", "begins", "ends", "counter"]
 _Rows = NDArray[np.int64]
 
 
@@ -131,44 +131,35 @@ def split_recording(
         )
     marked, ledger = recording.topics[main], Ledger()
     ledger.merge(recording.ledger)
-    runs = {column.column: _Runs.of(marked, column.column) for (column,) in matches.values()}
+    runs = [_Runs.of(marked, column.column) for (column,) in matches.values()]
     episodes = _episodes(recording.source, runs, ledger)
-    parts = {main: [episode.rows for episode in episodes]}
-    parts |= _by_stamps(recording, main, episodes, ledger)
-    names = tuple(n for n in marked.names if n not in runs or runs[n].kind == "counter")
+    parts = {main: [rows for _, _, rows in episodes]}
+    parts |= _by_stamps(recording, main, parts[main], ledger)
+    apart = {run.name for run in runs if run.kind != "counter"}
+    names = tuple(name for name in marked.names if name not in apart)
     topics = {**recording.topics, main: dataclasses.replace(marked, names=names)}
     topics = {name: _held(topic, parts[name]) for name, topic in topics.items()}
-    for i, episode in enumerate(episodes):
-        ended = [bool(v) for name, v in episode.fields.items() if last_part(name) in TERMINAL]
+    for i, (title, fields, _) in enumerate(episodes):
+        ended = [bool(value) for name, value in fields.items() if last_part(name) in TERMINAL]
         terminated = {"terminated": any(ended)} if ended else {}
         yield dataclasses.replace(
             recording,
-            name=f"{recording.name}-{episode.name}",
-            source=f"{recording.source}, {episode.title}",
+            name="-".join([recording.name, *(value for _, value in title)]),
+            source=", ".join([recording.source, *map(" ".join, title)]),
             topics={name: _slice(topic, parts[name][i]) for name, topic in topics.items()},
-            fields={**recording.fields, **episode.fields, **terminated},
+            fields={**recording.fields, **fields, **terminated},
             ledger=Ledger() if i else ledger,
         )
 
 
-@dataclass(frozen=True, slots=True)
-class _Part:
-    """Rows of an episode, and the values of its keys and flags."""
+@dataclass(frozen=True)
+class _Runs:
+    """Runs of equal cells of a column: its name, their first rows and values, and all rows."""
 
     name: str
-    title: str
-    fields: dict[str, Any]
-    rows: _Rows
-
-
-@dataclass(frozen=True, slots=True)
-class _Runs:
-    """Runs of equal cells of a column: first rows, values, and what the column is to episodes."""
-
     starts: _Rows
     values: Column
     rows: int
-    kind: _Kind
 
     @classmethod
     def of(cls, topic: Topic, name: str) -> Self:
@@ -180,12 +171,10 @@ class _Runs:
             starts.append(start + rows)
             values.append(cells[rows])
             last = cells[-1]
-        heads = np.concatenate(starts)
-        joined = np.concatenate(values) if values else np.zeros(0)
-        return cls(heads, joined, topic.rows, kind_of(name, heads, joined, topic.rows))
+        return cls(name, np.concatenate(starts), np.concatenate(values), topic.rows)
 
     def at(self, rows: _Rows) -> Column:
-        """Return the cells of some rows."""
+        """Return the cells of some rows, infinity where a number is missing."""
         return self.values[np.searchsorted(self.starts, rows, side="right") - 1]
 
     def firsts(self, rows: _Rows) -> _Rows:
@@ -198,34 +187,24 @@ class _Runs:
         present = np.flatnonzero(np.isfinite(cells))
         return present[1:][np.diff(cells[present]) < 0]
 
-
-def kind_of(name: str, starts: _Rows, values: Column, rows: int) -> _Kind:
-    """Return what a column is to episodes: by its cells and, where these leave it open, its name.
-
-    Parameters
-    ----------
-    name
-        Of the column.
-    starts, values
-        First rows of the runs of equal cells, and their values; infinity where one is missing.
-    rows
-        Number of cells.
-    """
-    if values.dtype.kind == "U":
-        return "key"
-    distinct = np.unique(values[np.isfinite(values)])
-    if {*distinct.tolist()} <= {0.0, 1.0}:
-        if last_part(name) in BEGINS | ENDS:
-            return "begins" if last_part(name) in BEGINS else "ends"
-        lengths = np.diff(np.append(starts, rows))
-        if lengths[values == 1].max(initial=0) == 1 < lengths.max():
-            return "begins" if values[0] == 1 else "ends"
-    steps = np.diff(values)
-    rises, falls = int((steps > 0).sum()), int((steps < 0).sum())
-    # The numbers of robots that write in turn rise as often as a counter of few rows.
-    rising = rises + (falls < rises and bool(COUNTS.search(name))) * falls
-    counts = COUNTS.search(name) or len(distinct) > falls + 1
-    return "counter" if counts and rising >= _STEADY * (rows - 1) else "key"
+    @functools.cached_property
+    def kind(self) -> Literal["key", "begins", "ends", "counter"]:
+        """What the column is to episodes: by its cells and, where these leave it open, its name."""
+        if self.values.dtype.kind == "U":
+            return "key"
+        distinct = np.unique(self.values[np.isfinite(self.values)])
+        if {*distinct.tolist()} <= {0.0, 1.0}:
+            if last_part(self.name) in BEGINS | ENDS:
+                return "begins" if last_part(self.name) in BEGINS else "ends"
+            lengths = np.diff(np.append(self.starts, self.rows))
+            if lengths[self.values == 1].max(initial=0) == 1 < lengths.max():
+                return "begins" if self.values[0] == 1 else "ends"
+        steps = np.diff(self.values)
+        rises, falls = int((steps > 0).sum()), int((steps < 0).sum())
+        # The numbers of robots that write in turn rise as often as a counter of few rows.
+        rising = rises + (falls < rises and bool(COUNTS.search(self.name))) * falls
+        counts = COUNTS.search(self.name) or len(distinct) > falls + 1
+        return "counter" if counts and rising >= _STEADY * (self.rows - 1) else "key"
 
 
 def last_part(name: str) -> str:
@@ -233,87 +212,67 @@ def last_part(name: str) -> str:
     return re.split(r"[./:]", name)[-1].strip().lower()
 
 
-def _episodes(source: str, runs: Mapping[str, _Runs], ledger: Ledger) -> list[_Part]:
-    """Return the episodes, in the order of their first rows."""
-    total = next(iter(runs.values())).rows
-    keys = {name: r for name, r in runs.items() if r.kind == "key"}
-    marks = {name: r for name, r in runs.items() if r.kind != "key"}
-    groups = _by_key(keys, source, ledger) if keys else [({}, np.arange(total))]
+def _episodes(
+    source: str, runs: Sequence[_Runs], ledger: Ledger
+) -> list[tuple[list[tuple[str, str]], dict[str, Any], _Rows]]:
+    """Return title, values of keys and flags, and rows of episodes, in the order of first rows."""
+    keys = [r for r in runs if r.kind == "key"]
+    marks = [r for r in runs if r.kind != "key"]
     episodes, single = [], 0
-    for fields, rows in groups:
-        cuts = np.concatenate([np.zeros(1, np.int64), *(r.firsts(rows) for r in marks.values())])
+    for rows in _by_key(keys, source, ledger) if keys else [np.arange(runs[0].rows)]:
+        fields = {r.name: plain_label(r.at(rows[:1]).item()) for r in keys}
+        title = [(name, str(value)) for name, value in fields.items()]
+        cuts = np.concatenate([np.zeros(1, np.int64), *(r.firsts(rows) for r in marks)])
         for i, part in enumerate(np.split(rows, np.unique(cuts)[1:])):
-            if len(part) < 2:
+            flags = {r.name: int(r.at(part[-1:])[0] == 1) for r in marks if r.kind == "ends"}
+            number = [("episode", str(i))] if marks else []
+            if len(part) > 1:
+                episodes.append((title + number, fields | flags, part))
+            else:
                 single += 1
-                continue
-            flags = {n: int(r.at(part[-1:])[0] == 1) for n, r in marks.items() if r.kind == "ends"}
-            values, titles = [*fields.values(), *[i] * bool(marks)], fields | {"episode": i}
-            title = ", ".join(f"{k} {v}" for k, v in (titles if marks else fields).items())
-            episodes.append(_Part("-".join(map(str, values)), title, {**fields, **flags}, part))
     if not episodes or single > len(episodes):
-        names = " and ".join(map(repr, runs))
+        names = " and ".join(repr(r.name) for r in runs)
         raise UsageError(
             f"{source}: by {names} (episode), {single} of {single + len(episodes)} episodes have a "
             "single row, expected a column that stays the same in an episode, flags of its last "
             "row, or a counter that starts anew"
         )
     ledger.add("episode", "dropped", "it has a single row", count=single, source=source)
-    return sorted(episodes, key=lambda episode: int(episode.rows[0]))
+    return sorted(episodes, key=lambda episode: int(episode[2][0]))
 
 
-def _by_key(
-    keys: Mapping[str, _Runs], source: str, ledger: Ledger
-) -> Iterator[tuple[dict[str, Any], _Rows]]:
-    """Yield the values of keys and the rows that have them."""
-    total = next(iter(keys.values())).rows
-    starts = functools.reduce(np.union1d, [r.starts for r in keys.values()])
-    lengths = np.diff(np.append(starts, total))
+def _by_key(keys: Sequence[_Runs], source: str, ledger: Ledger) -> Iterator[_Rows]:
+    """Yield the rows that have the same values of keys."""
+    starts = functools.reduce(np.union1d, [r.starts for r in keys])
+    lengths = np.diff(np.append(starts, keys[0].rows))
     group, lacks = np.zeros(len(starts), np.int64), np.zeros(len(starts), bool)
-    for r in keys.values():
+    for r in keys:
         values, codes = np.unique(r.at(starts), return_inverse=True)
-        lacks |= np.array([*map(_is_missing, values.tolist())], bool)[codes]
+        lacks |= np.array([str(v).strip().lower() in _NO_VALUE for v in values.tolist()])[codes]
         group = group * len(values) + codes
     # A cell that is missing within an episode is of this episode.
-    there = np.flatnonzero(~lacks)
-    before = np.searchsorted(there, np.arange(len(starts)), side="right") - 1
-    inside = lacks & (before >= 0) & (before < len(there) - 1)
-    last, following = there[before[inside]], there[before[inside] + 1]
-    inside[inside] = group[last] == group[following]
-    group[inside] = group[there[before[inside]]]
-    lacks &= ~inside
-    absent = int(lengths[lacks].sum())
-    first = int(starts[lacks][0]) if absent else None
+    runs = np.arange(len(starts))
+    before = np.maximum.accumulate(np.where(lacks, 0, runs))
+    following = np.minimum.accumulate(np.where(lacks, runs[-1], runs)[::-1])[::-1]
+    lacks &= lacks[before] | (group[before] != group[following])
+    group = np.repeat(np.where(lacks, -1, group[before]), lengths)
+    order = np.argsort(group, kind="stable")
+    absent = int((group < 0).sum())
     reason = "no value of the column that tells episodes apart"
-    name = " and ".join(keys)
-    ledger.add("row", "dropped", reason, name=name, count=absent, source=source, row=first)
-    kept = np.flatnonzero(~lacks)
-    order = kept[np.argsort(group[kept], kind="stable")]
-    for block in np.split(order, np.flatnonzero(np.diff(group[order])) + 1) if len(order) else ():
-        cells = {name: r.at(starts[block[:1]]) for name, r in keys.items()}
-        whole = {name for name, cell in cells.items() if cell.dtype.kind == "f" and not cell % 1}
-        fields = {n: int(cell[0]) if n in whole else cell.item() for n, cell in cells.items()}
-        yield fields, _spread(starts[block], lengths[block])
-
-
-def _is_missing(value: Any) -> bool:
-    return str(value).strip().lower() in _NO_VALUE
-
-
-def _spread(starts: _Rows, lengths: _Rows) -> _Rows:
-    """Return the rows of runs, one behind the other."""
-    ends = np.cumsum(lengths)
-    return np.arange(ends[-1]) + np.repeat(starts - ends + lengths, lengths)
+    name = " and ".join(r.name for r in keys)
+    ledger.add("row", "dropped", reason, name=name, count=absent, source=source, row=int(order[0]))
+    order = order[absent:]
+    yield from filter(len, np.split(order, np.flatnonzero(np.diff(group[order])) + 1))
 
 
 def _by_stamps(
-    recording: Recording, main: str, episodes: Sequence[_Part], ledger: Ledger
+    recording: Recording, main: str, episodes: Sequence[_Rows], ledger: Ledger
 ) -> dict[str, list[_Rows]]:
     """Return the rows of each episode in the other topics: from its first stamp to the next one."""
-    others = {name: topic for name, topic in recording.topics.items() if name != main}
+    others = [name for name in recording.topics if name != main]
     if not others:
         return {}
-    spans = [(int(episode.rows[0]), int(episode.rows[-1])) for episode in episodes]
-    is_mixed = any(b[0] < a[1] for a, b in itertools.pairwise(spans))
+    is_mixed = any(b[0] < a[-1] for a, b in itertools.pairwise(episodes))
     if is_mixed or not all(topic.time for topic in recording.topics.values()):
         problem = "episodes overlap" if is_mixed else "not all topics have stamps"
         raise UsageError(
@@ -324,12 +283,14 @@ def _by_stamps(
         name: np.concatenate([cells for _, cells in read_column(topic, topic.time)])
         for name, topic in recording.topics.items()
     }
-    begins = stamps[main][[first for first, _ in spans]]
-    cuts = {n: np.append(np.searchsorted(stamps[n], begins), len(stamps[n])) for n in others}
-    for name, rows in cuts.items():
+    begins = stamps[main][[rows[0] for rows in episodes]]
+    parts = {}
+    for name in others:
+        cuts = np.append(np.searchsorted(stamps[name], begins), len(stamps[name]))
         reason, source = "before the first episode", recording.source
-        ledger.add("row", "dropped", reason, name=name, count=int(rows[0]), source=source, row=0)
-    return {n: [*map(np.arange, rows[:-1], rows[1:])] for n, rows in cuts.items()}
+        ledger.add("row", "dropped", reason, name=name, count=int(cuts[0]), source=source, row=0)
+        parts[name] = [*map(np.arange, cuts[:-1], cuts[1:])]
+    return parts
 
 
 def _held(topic: Topic, episodes: Sequence[_Rows]) -> Topic:
@@ -360,15 +321,14 @@ def _slice(topic: Topic, rows: _Rows) -> Topic:
 
     def read(names: Sequence[str], start: int, stop: int) -> dict[str, Column]:
         left = rows[start:stop]
-        parts: dict[str, list[Column]] = {name: [] for name in names}
+        if not len(left):
+            return dict.fromkeys(names, np.zeros(0))
         # Large tables on disk are read in blocks.
-        while len(left):
-            begin = int(left[0])
-            here = left[left < begin + _BLOCK]
-            cells = topic.read(names, begin, int(here[-1]) + 1)
-            for name, column in cells.items():
-                parts[name].append(column[here - begin])
-            left = left[len(here) :]
-        return {name: np.concatenate(blocks or [np.zeros(0)]) for name, blocks in parts.items()}
+        blocks = np.split(left, np.flatnonzero(np.diff(left // _BLOCK)) + 1)
+        cells = [
+            {n: x[b - b[0]] for n, x in topic.read(names, int(b[0]), int(b[-1]) + 1).items()}
+            for b in blocks
+        ]
+        return {name: np.concatenate([c[name] for c in cells]) for name in names}
 
     return dataclasses.replace(topic, rows=count, read=read)
