@@ -1,7 +1,8 @@
 """Evidence about one episode: of a detector, of the stream, and of its figures as a whole.
 
-Each has a surprise, ``-log p``. A score takes half of what is odd by chance, faults of the stream
-and figures of the episode a quarter each, so that the smallest p-value over its share is one, too.
+Each has a surprise, ``-log p``. What is odd by chance is shared out among them, so that the
+smallest p-value over its share is one, too. A ranking promises nothing and needs no tail: it goes
+by how far an episode is beyond the median of the others, in units of the middle ones.
 """
 
 import math
@@ -21,13 +22,13 @@ from oodd_logs.episodes import Episode
 from oodd_logs.marks import runs_of
 from oodd_logs.scanning.episode_faults import EpisodeFault
 from oodd_logs.scanning.figures import Figure
-from oodd_logs.scanning.outliers import ENOUGH, LEAST, Tail, mean_beyond, surprise
+from oodd_logs.scanning.outliers import ENOUGH, LEAST, MOST_ODD, Tail, mean_beyond, surprise
 
 Floats = NDArray[np.float64]
 
 _NAMED: Final = 2  # sensors in a reason
 
-SHARES: Final = (0.5, 0.25, 0.25)
+SHARES: Final = (0.5, 0.1, 0.4)
 """Of score, stream and figures in what is odd by chance."""
 SCORE, STREAM, FIGURES = map(math.log, SHARES)
 
@@ -57,10 +58,6 @@ class Peers(NamedTuple):
     def units(self) -> int:
         """Number of recordings, or of windows that count as such."""
         return round(float(self.weights.sum()))
-
-    def surprise(self, values: Floats, i: int) -> float:
-        """Return the surprise of one of the values beside those of the peers."""
-        return surprise(float(values[i]), values[self.numbers], self.weights)
 
 
 class Readings(NamedTuple):
@@ -294,8 +291,10 @@ class Evidence:
         return Finding(interval[0], since, tuple(above), sensors, reason)
 
 
-def surprises(largest: Floats, stream: Floats, distances: Floats, peers: Sequence[Peers]) -> Floats:
-    """Return the surprise of score, stream and figures of each episode, each with its share.
+def evidence_of(
+    largest: Floats, stream: Floats, distances: Floats, peers: Sequence[Peers]
+) -> tuple[Floats, Floats]:
+    """Return surprise and place value of score, stream and figures of each episode.
 
     Parameters
     ----------
@@ -306,16 +305,26 @@ def surprises(largest: Floats, stream: Floats, distances: Floats, peers: Sequenc
 
     Returns
     -------
-    array of shape (N, 3)
+    surprises : array of shape (N, 3)
+        Each with its share.
+    excesses : array of shape (N, 3)
+        By which episodes are ranked.
     """
-    found = np.empty((len(largest), 3))
-    for i, others in enumerate(peers):
+    surprises, excesses = np.empty((2, len(largest), 3))
+    # Figures of real episodes have heavier tails than statistics of detectors.
+    roots = np.sqrt(distances)
+    for i, (others, weights) in enumerate(peers):
         # How long a fault lasts does not say how rare it is, where few episodes have none.
-        most = math.inf if others.units + 1 >= ENOUGH else math.log(others.units + 1)
-        usual = stream[i] / max(1.0, mean_beyond(stream[others.numbers]))
-        found[i] = (
-            others.surprise(largest, i) + SCORE,
-            min(usual, most) + STREAM,
-            others.surprise(distances, i) + FIGURES,
-        )
-    return found
+        n = round(float(weights.sum())) + 1
+        usual = float(stream[i]) / max(1.0, mean_beyond(stream[others]))
+        faults = min(usual, math.inf if n >= ENOUGH else math.log(n))
+        tails = [surprise(float(x[i]), x[others], weights) for x in (largest, roots)]
+        surprises[i] = tails[0], faults, tails[1]
+        beyond = []
+        for x in (largest, distances):
+            unit = mean_beyond(x[others], MOST_ODD)
+            with np.errstate(invalid="ignore"):  # infinite ones
+                beyond.append((x[i] - np.median(x[others])) / unit if unit > 0 else 0.0)
+        excesses[i] = beyond[0], faults, beyond[1]
+    shares = np.log(SHARES)
+    return surprises + shares, np.nan_to_num(excesses, nan=0.0) + shares

@@ -4,14 +4,13 @@ A row can show what is there and odd, but not what is missing: a torque peak, a 
 So figures of each episode are compared with those of the others.
 """
 
-import math
 from collections.abc import Hashable, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_logs.scanning.outliers import LEAST, ODD_SHARE
+from oodd_logs.scanning.outliers import LEAST
 
 Floats = NDArray[np.float64]
 
@@ -30,8 +29,7 @@ class Figure(NamedTuple):
     Attributes
     ----------
     distance
-        Square root of its usual deviations: figures of real episodes have heavier tails than
-        statistics of detectors.
+        In usual deviations, the median of those of the others.
     sensor
         Its number.
     row
@@ -77,7 +75,7 @@ def compare_figures(episodes: Sequence[Floats], groups: Sequence[Hashable]) -> l
                 row = int(np.nanargmax(rows) if k else np.nanargmin(rows))
             low, high = ends[:, k, d]
             reason = f"is {figures[i, k, d]:.3g}, of most others {low:.3g} to {high:.3g}"
-            found[i] = Figure(math.sqrt(away[k, d]), d, row, f"{KINDS[k]} of", reason)
+            found[i] = Figure(float(away[k, d]), d, row, f"{KINDS[k]} of", reason)
     return [found[i] for i in range(len(episodes))]
 
 
@@ -103,8 +101,7 @@ def _compared(figures: Floats, peers: Floats) -> tuple[Floats, Floats]:
     least = np.stack([floor, floor, floor, np.where(moves, _LOG, _CONSTANT)])
     parts = [np.concatenate([x[:, :3], np.log(x[:, 3:] + floor)], axis=1) for x in (figures, peers)]
     centre = np.nanmedian(parts[1], axis=0)
-    usual = np.sort(np.abs(parts[1] - centre), axis=0)
-    kept = usual[: max(1, math.ceil((1 - ODD_SHARE) * len(peers)))]
-    deviation = np.maximum(np.nan_to_num(np.nanmean(kept, axis=0)), least)
+    usual = np.nanmedian(np.abs(parts[1] - centre), axis=0)
+    deviation = np.maximum(np.nan_to_num(usual), least)
     away = np.nan_to_num(parts[0] - centre)
     return np.abs(away) / deviation, away > 0

@@ -25,6 +25,8 @@ ENOUGH: Final = 20
 """Episodes from which on a tail finds what stands out."""
 ODD_SHARE: Final = 0.2
 """Share of the others that may be odd, too, without a word in the tail: the largest of them."""
+MOST_ODD: Final = 0.35
+"""Share of the others that may be odd without hiding one another in a ranking."""
 _ROUNDING: Final = 1e-9  # of an episode
 _MOST: Final = 300.0  # surprise up to which statistics are told apart
 
@@ -140,16 +142,17 @@ def surprise(value: float, others: Floats, weights: Floats | None = None) -> flo
     return float(tail.surprise(value))
 
 
-def mean_beyond(others: Floats) -> float:
-    """Return by how much values exceed their median, the largest fifth of all censored.
+def mean_beyond(values: Floats, odd: float = ODD_SHARE) -> float:
+    """Return by how much values exceed their median, with a share of the largest censored.
 
     Surprises of nominal episodes, which fall off exponentially, do so by 1.
     """
-    ordered = np.sort(others)
+    ordered = np.sort(values)
     n, middle = len(ordered), (len(ordered) + 1) // 2
-    seen = max(1, math.floor((1 - ODD_SHARE) * n) - middle)
-    above = ordered[middle:] - ordered[middle - 1]
-    return float(np.minimum(above, above[seen - 1 : seen].max(initial=0.0)).sum() / seen)
+    above = ordered[middle:] - ordered[middle - 1 : middle]
+    seen = max(1, math.floor((1 - odd) * n) - middle)
+    censored = np.minimum(above, above[seen - 1 : seen].max(initial=0.0)).sum() / seen
+    return float(censored or above.mean() if len(above) else 0.0)
 
 
 def rank_p(largest: float, others: Floats, weights: Floats | None = None) -> float:

@@ -37,7 +37,7 @@ from oodd_logs.scanning.episode_faults import (
     gaps,
     stream_scale,
 )
-from oodd_logs.scanning.evidence import SCORE, Evidence, Finding, Peers, Readings, surprises
+from oodd_logs.scanning.evidence import SCORE, Evidence, Finding, Peers, Readings, evidence_of
 from oodd_logs.scanning.figures import compare_figures
 from oodd_logs.scanning.fits import Fit, thinned
 from oodd_logs.scanning.limits import FITS, SHORTEST, WINDOWS
@@ -522,7 +522,8 @@ class _Passes:
         outcomes = self.fit.thinned(step).cross(trajectories, folds=folds, jobs=self.jobs)
         statistics = self._statistics([scores for scores, _ in outcomes])
         largest = np.array([np.nanmax(x, initial=-math.inf) for x in statistics])
-        order = np.lexsort((-largest, -surprises(largest, *beside, self.peers).max(axis=1)))
+        _, excesses = evidence_of(largest, *beside, self.peers)
+        order = np.argsort(-excesses.max(axis=1), kind="stable")
         words = f"ranked by {counted(folds, 'fit(s)')}"
         if self.progress is not None:
             self.progress(words, [self.episodes[i].name for i in order])
@@ -559,11 +560,12 @@ class _Terms:
 class _Comparison:
     """Comparison of episodes with one another, with those that are confirmed, or with others."""
 
-    # Surprises of score, stream and figures, (N, 3); ranks among what they are compared with, the
-    # fewest of these, and whether they are kept apart; if exact, ranks are the p-values. The
-    # statistic with a p-value, which depends on the episode.
+    # Surprises and excesses of score, stream and figures, (N, 3); ranks among what is compared
+    # with, the fewest of these, and whether they are kept apart; if exact, ranks are the p-values.
+    # The statistic with a surprise, which depends on the episode.
 
     surprises: Floats
+    excesses: Floats
     tails: Sequence[Tail | None]
     ranks: Floats
     units: int
@@ -584,7 +586,7 @@ def _by_calibration(
         found = np.column_stack([np.zeros(count), *[np.full(count, -math.inf)] * 2])
         nothing: tuple[list[None], Floats] = [None] * count, np.full(count, math.nan)
         apart = True, False, lambda *_: limit, [False] * count
-        return _Comparison(found, *nothing, 0, *apart, limit)
+        return _Comparison(found, found, *nothing, 0, *apart, limit)
     numbers = np.array(calibration.recordings)
     recordings = len({*numbers.tolist()})
     # Windows count where recordings are too few.
@@ -603,7 +605,7 @@ def _by_calibration(
     ranks = np.array([rank_p(x, *reference) for x in largest.tolist()])
     found = np.column_stack([score, *[np.full(count, -math.inf)] * 2])
     apart = True, exact, threshold, [False] * count
-    return _Comparison(found, [tail] * count, ranks, units, *apart, limit)
+    return _Comparison(found, found, [tail] * count, ranks, units, *apart, limit)
 
 
 def _by_others(
@@ -621,8 +623,8 @@ def _by_others(
     distances = np.array([one.figure.distance if one.figure else 0.0 for one in evidence])
     # Ranks are exact where all are compared alike.
     compared = peers if exact else reference
-    found = surprises(largest, stream, distances, compared)
-    best = found.max(axis=1)
+    found, excesses = evidence_of(largest, stream, distances, compared)
+    best, rank = found.max(axis=1), excesses.max(axis=1)
     tails = [Tail.fit(largest[x.numbers], x.weights) for x in compared]
     ranks = [rank_p(x, best[y.numbers], y.weights) for x, y in zip(best, reference, strict=True)]
 
@@ -634,10 +636,12 @@ def _by_others(
         return math.nan if tail is None else float(tail.value(needed - SCORE))
 
     above = [
-        is_apart and bool(x > best[y.numbers].max()) for x, y in zip(best, reference, strict=True)
+        is_apart and bool(x > rank[y.numbers].max()) for x, y in zip(rank, reference, strict=True)
     ]
     units = min(others.units for others in reference)
-    return _Comparison(found, tails, np.array(ranks), units, is_apart, exact, threshold, above)
+    return _Comparison(
+        found, excesses, tails, np.array(ranks), units, is_apart, exact, threshold, above
+    )
 
 
 def _verdict(
@@ -657,7 +661,7 @@ def _verdict(
     called = q <= fdr
     mixed = not comparison.is_apart and bool(called.sum() > ODD_SHARE * tested.sum())
     notes = [*terms.notes, *_remarks(comparison, int(called.sum()) if mixed else 0, len(fine))]
-    order = np.lexsort((-largest, -best, ~tested)).tolist()
+    order = np.lexsort((-largest, -comparison.excesses.max(axis=1), ~called, ~tested)).tolist()
     places = {i: place for place, i in enumerate(order, 1)}
     needed = -math.log(critical if critical > 0 else _FEW)
     sums = np.stack([one.sums for one in evidence])
@@ -672,7 +676,14 @@ def _verdict(
         joint = one.joint(tail, float(found[1]))
         faults = one.listed(needed, names)
         limits = threshold if odd else math.inf, -math.inf if tail is None else tail.start
-        finding = one.finding(found, joint, limits, sums.sum(axis=0) - sums[i], faults, names)
+        finding = one.finding(
+            found if odd else comparison.excesses[i],
+            joint,
+            limits,
+            sums.sum(axis=0) - sums[i],
+            faults,
+            names,
+        )
         shown = finding if band != "fine" else Finding(None, None, (), {}, finding.reason)
         as_rare = -math.inf
         if tail is not None and math.isfinite(found[2]):
