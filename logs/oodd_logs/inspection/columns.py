@@ -92,8 +92,8 @@ class ColumnFacts:
     values
         Cells by value, None where there are more than `FEW` values.
     codes, inner
-        By numbers that often stand for a missing value, their cells by recording, and the range of
-        all other numbers.
+        By numbers that often stand for a missing value, their cells by recording, and of blocks
+        with such the first and the 99th percentile of the other numbers.
     steps, falls, rises
         Number of differences between neighbouring rows, and of those below and above zero.
     span
@@ -118,7 +118,7 @@ class ColumnFacts:
     numbers: RunningMoments = field(default_factory=RunningMoments)
     values: Counter[float | str] | None = field(default_factory=Counter)
     codes: dict[float, Counter[str]] = field(default_factory=dict)
-    inner: tuple[float, float] = (math.inf, -math.inf)
+    inner: list[tuple[float, float]] = field(default_factory=list)
     steps: int = 0
     falls: int = 0
     rises: int = 0
@@ -200,16 +200,17 @@ class ColumnFacts:
             yield i, cells[recordings == i]
 
     def _count_codes(self, present: NDArray[np.float64], numbers: NDArray[np.float64]) -> None:
-        """Count cells that may stand for a missing value, and keep the range of the others."""
-        low, high = float(present.min()), float(present.max())
-        if not NUMBERS.isdisjoint((low, high)):
-            coded = np.isin(numbers, [*NUMBERS])
-            for i, rows in self._by_recording(np.flatnonzero(coded)):
-                for code in numbers[rows].tolist():
-                    self.codes.setdefault(code, Counter())[self.sources[i]] += 1
-            others = numbers[np.isfinite(numbers) & ~coded]
-            low, high = others.min(initial=math.inf), others.max(initial=-math.inf)
-        self.inner = min(self.inner[0], float(low)), max(self.inner[1], float(high))
+        """Count cells that may stand for a missing value, and keep where most others are."""
+        if NUMBERS.isdisjoint((float(present.min()), float(present.max()))):
+            return
+        coded = np.isin(numbers, [*NUMBERS])
+        for i, rows in self._by_recording(np.flatnonzero(coded)):
+            for code in numbers[rows].tolist():
+                self.codes.setdefault(code, Counter())[self.sources[i]] += 1
+        others = numbers[np.isfinite(numbers) & ~coded]
+        if len(others):
+            low, high = np.percentile(others, (1, 99)).tolist()
+            self.inner.append((low, high))
 
     def _count_missing(self, absent: NDArray[np.bool_]) -> None:
         if not absent.any():

@@ -248,7 +248,8 @@ def describe_logs(logs: Inspection, width: int = 80) -> str:
     if len(logs.topics) > 1:
         parts.append(_topic_table(logs))
     parts.append(_column_table(logs, width))
-    said = [e for e in logs.ledger if (e.item, e.fate) != ("column", "dropped")]
+    roles = {e.name for e in logs.ledger.of("column", "dropped")} & {*logs.columns}
+    said = [e for e in logs.ledger if e.fate != "dropped" or e.name not in roles]
     lines = [entry.line(len(logs.recordings)) for entry in said[:_LINES]]
     lines += [f"{len(said) - _LINES} more, which --json has"] if len(said) > _LINES else []
     advice = [*advise(logs), *(Advice("ledger", line) for line in lines)]

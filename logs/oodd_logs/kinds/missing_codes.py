@@ -5,6 +5,8 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
+import numpy as np
+
 from oodd_eval.errors import UsageError
 from oodd_logs.kinds import Kind
 
@@ -55,7 +57,7 @@ def _recognise(columns: Mapping[str, Any]) -> dict[str | tuple[str, ...], Any]:
     """
     recognised: dict[str | tuple[str, ...], Any] = {}
     for name, facts in columns.items():
-        low, high = facts.inner
+        low, high = np.median(facts.inner or [(0.0, 0.0)], axis=0)
         least = max(2, _FEW * facts.recordings) if facts.recordings > 1 else 1
         cells = {code: sum(counts.values()) for code, counts in facts.codes.items()}
         usual = [c for c in cells if len(facts.codes[c]) >= least and cells[c] > 1]
