@@ -98,7 +98,7 @@ def run(name, root, detectors, results):
     parts = {"training": data.train, "calibration": data.calibration, "nominal test": data.twins}
     sizes = [f"{len(part)} {title}" for title, part in parts.items()]
     sizes += [f"{len(data.labelled(anomaly))} {anomaly}" for anomaly in data.anomalies]
-    imported = f"Imported here, of a part of the set: {', '.join(sizes)} episodes; digest"
+    imported = f"Imported here: {', '.join(sizes)} episodes; digest"
     doubts = "\n".join(f"- {_promise(finding)}." for finding in promises_of(data))
     names = [n for n in detectors if n not in WITH_ACTIONS or data.actions]
     with warnings.catch_warnings():
