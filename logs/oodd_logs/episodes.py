@@ -8,6 +8,7 @@ import dataclasses
 import glob
 import itertools
 import unicodedata
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,7 +26,14 @@ from oodd_eval.metrics.faults import FAR
 from oodd_eval.names import check_known, counted
 from oodd_logs.kinds import Matrix
 from oodd_logs.ledger import Item, Ledger
-from oodd_logs.marks import AnomalousRows, IntervalList, LabelValues, merged, rows_of
+from oodd_logs.marks import (
+    AnomalousRows,
+    IntervalList,
+    LabelCounts,
+    label_problems,
+    merged,
+    rows_of,
+)
 from oodd_logs.readers import in_order as natural_order
 from oodd_logs.recipe import FAILURE, AnomalousFiles, Recipe, anomaly_name
 from oodd_logs.recorded import FILES, NOMINAL_ROLES, SLOWER, Recorded, StampedRows, text_of
@@ -480,10 +488,8 @@ class _Reading:
     problems: list[str] = field(default_factory=list)
     failures: list[Exception] = field(default_factory=list)  # of what a scan leaves out
     cut_by_outcome: set[str] = field(default_factory=set)  # parts with windows without a label
-    label_values: LabelValues = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.label_values = LabelValues(self.recipe)
+    label_counts: LabelCounts = field(default_factory=lambda: defaultdict(Counter))
+    unlabelled: set[str] = field(default_factory=set)  # label columns that recordings lack
 
     @property
     def recordings(self) -> int:
@@ -540,7 +546,9 @@ def _add(reading: _Reading, recorded: Recorded) -> None:
                 number,
             )
             _keep(reading, facts, label)
-    reading.label_values.merge(stamped.labels)
+    for text, counts in stamped.labels.items():
+        reading.label_counts[text].update(counts)
+    reading.unlabelled |= {*recipe.label_columns} - {*stamped.labels}
     for text in recipe.label_columns:
         if text not in selection.labels and (text in recipe.labels or recorded.kinds):
             ledger.add("recording", "kept", f"has no column {text!r}: rows count as nominal")
@@ -818,7 +826,7 @@ def _in_parts(reading: _Reading) -> EpisodeSource:
         if reading.by_stamps:
             source.parts[EVERY].sort(key=lambda facts: facts.begin)
         _say_far(source)
-        for text, problem in reading.label_values.problems():
+        for text, problem in label_problems(reading.label_counts, reading.unlabelled, recipe):
             reading.ledger.add("column", "kept", problem, name=text)
         return source
     if reading.first is None:
@@ -829,7 +837,7 @@ def _in_parts(reading: _Reading) -> EpisodeSource:
     for text in (text for text in recipe.label_columns if text not in labelled):
         columns = {name for layout in selections for name in named_columns(layout)}
         raise UnknownNameError("column with labels", text, columns)
-    for _, problem in reading.label_values.problems():
+    for _, problem in label_problems(reading.label_counts, reading.unlabelled, recipe):
         raise UsageError(problem)
     for problem in reading.problems:
         raise TrajectoryError(problem)

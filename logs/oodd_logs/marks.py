@@ -10,11 +10,11 @@ import itertools
 import json
 import math
 import re
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from oodd_eval.data.bounded import read_bytes
 from oodd_eval.errors import TrajectoryError, UnknownNameError, UsageError
 from oodd_eval.names import is_plain, natural
+from oodd_logs.readers.packed import stem
 from oodd_logs.recipe import Interval, Recipe
 from oodd_logs.recording import Column
 from oodd_logs.selecting import split_unit
@@ -35,12 +36,6 @@ NOMINAL_WORDS: Final = re.compile(
     re.IGNORECASE,
 )
 """Words of nominal files, values and labels."""
-
-SAYS_NOMINAL: Final = re.compile(
-    r"(?:is[_ ]?)?(?:healthy|normal|nominal|ok|good|inlier|valid|pass|passed|success)",
-    re.IGNORECASE,
-)
-"""Whole names of labels that are true of nominal rows."""
 
 _SHORT: Final = frozenset({"h", "0", "n", "ok", "pass", "passed", "inlier", "none", "no"})
 _TRUE: Final = frozenset({"1", "1.0", "true", "yes", "y"})
@@ -85,68 +80,61 @@ def anomalous_cells(values: Column, recipe: Recipe, *, before: bool) -> NDArray[
     """
     nominal = recipe.nominal_label
     if values.dtype.kind == "U":
-        texts = {str(v).strip().lower() for v in nominal} if nominal else {*NOMINAL_LABELS}
-        labels, codes = np.unique(values, return_inverse=True)
-        wrong = np.array([text.strip().lower() not in texts for text in labels.tolist()], bool)
-        return np.asarray(wrong[codes], bool)
+        texts = [str(v).strip().lower() for v in nominal] or [*NOMINAL_LABELS]
+        return ~np.isin(np.strings.lower(np.strings.strip(values)), texts)
     numbers = [float(v) for v in nominal if isinstance(v, int | float)] if nominal else [0.0]
     present = np.where(np.isnan(values), -1, np.arange(len(values)))
     held = np.maximum.accumulate(present)
     return np.asarray(np.where(held < 0, before, ~np.isin(values, numbers)[held]), bool)
 
 
-class LabelValues:
-    """Cells of the label columns that were read, and what is amiss with them as labels.
+LabelCounts = dict[str, Counter[float | str]]
+"""Number of rows of each label, by the text of the column in the recipe."""
+
+
+def counted_labels(cells: Column) -> Counter[float | str]:
+    """Return how often the values of a column are there, those of the first ones in order."""
+    values, counts = np.unique(cells[cells == cells], return_counts=True)  # noqa: PLR0124
+    return Counter(dict(zip(values.tolist()[:_KEPT], counts.tolist(), strict=False)))
+
+
+def are_signed(labels: Iterable[float | str], recipe: Recipe) -> bool:
+    """Tell whether -1 is a label, and nothing says of what rows."""
+    return not recipe.nominal_label and bool({-1.0, "-1"} & {*labels})
+
+
+def label_problems(
+    counts: LabelCounts, lacking: Collection[str], recipe: Recipe
+) -> Iterator[tuple[str, str]]:
+    """Yield the columns that do not say which rows are nominal, each with what to do.
 
     Parameters
     ----------
+    counts
+        Labels of all recordings.
+    lacking
+        Columns that some recordings do not have.
     recipe
-        Its `nominal_label` says which are nominal.
+        Its `nominal_label` says which labels are nominal.
     """
-
-    def __init__(self, recipe: Recipe) -> None:
-        self._recipe = recipe
-        self._counts: dict[str, Counter[float | str]] = {}
-        self._lacking: set[str] = set()
-
-    def add(self, text: str, cells: Column) -> None:
-        """Count the cells of a column, by its text in the recipe."""
-        values, counts = np.unique(cells[cells == cells], return_counts=True)  # noqa: PLR0124
-        pairs = zip(values.tolist()[:_KEPT], counts.tolist(), strict=False)
-        self._counts.setdefault(text, Counter()).update(dict(pairs))
-
-    def merge(self, other: Self) -> None:
-        """Add the cells of another recording, and the columns that it lacks."""
-        for text, counts in other._counts.items():
-            self._counts.setdefault(text, Counter()).update(counts)
-        self._lacking |= {*self._recipe.label_columns} - {*other._counts}
-
-    def is_signed(self, text: str) -> bool:
-        """Tell whether -1 is a label, and nothing says of what rows."""
-        return not self._recipe.nominal_label and bool({-1.0, "-1"} & {*self._counts.get(text, ())})
-
-    def problems(self) -> Iterator[tuple[str, str]]:
-        """Yield the columns that do not say which rows are nominal, each with what to do."""
-        nominal = self._recipe.nominal_label
-        for text, counts in self._counts.items():
-            labels = Counter({v: n for v, n in counts.items() if str(v).strip()})
-            said = [not anomalous_cells(np.array([v]), self._recipe, before=False) for v in counts]
-            why = ""
-            if self.is_signed(text):
-                why = "-1 is the label of nominal rows in some logs, of anomalous ones in others"
-            elif not any(said) and text not in self._lacking:
-                accepted = (
-                    f"nominal_label is {[*nominal]}" if nominal else "0, false, H, or nothing"
-                )
-                why = f"none of them is nominal ({accepted})"
-            elif not nominal and says_nominal(text):
-                why = "by its name 1 is nominal, and without nominal_label 0 is"
-            if why:
-                rows = ", ".join(f"{plain_label(v)!r} ({n} rows)" for v, n in labels.most_common(6))
-                likely, reason = likely_nominal(text, labels)
-                key = f"nominal_label = {json.dumps([*map(plain_label, likely)])}"
-                advice = f"{key}, if that is nominal{reason}" if likely else "nominal_label = [...]"
-                yield text, f"labels {text!r} are {rows}, and {why}: write {advice}"
+    nominal = recipe.nominal_label
+    for text, values in counts.items():
+        labels = Counter({v: n for v, n in values.items() if str(v).strip()})
+        said = [not anomalous_cells(np.array([v]), recipe, before=False) for v in values]
+        if are_signed(values, recipe):
+            why = "-1 is the label of nominal rows in some logs, of anomalous ones in others"
+        elif not any(said) and text not in lacking:
+            accepted = f"nominal_label is {[*nominal]}" if nominal else "0, false, H, or nothing"
+            why = f"none of them is nominal ({accepted})"
+        elif not nominal and says_nominal(text):
+            why = "by its name 1 is nominal, and without nominal_label 0 is"
+        else:
+            continue
+        rows = ", ".join(f"{plain_label(v)!r} ({n} rows)" for v, n in labels.most_common(6))
+        likely, reason = likely_nominal(text, labels)
+        key = f"nominal_label = {json.dumps([*map(plain_label, likely)])}"
+        advice = f"{key}, if that is nominal{reason}" if likely else "nominal_label = [...]"
+        yield text, f"labels {text!r} are {rows}, and {why}: write {advice}"
 
 
 def likely_nominal(
@@ -172,8 +160,10 @@ def likely_nominal(
     >>> likely_nominal("fault", {0.0: 7, 1.0: 9}), likely_nominal("y", {1.0: 90, -1.0: 9})
     (((0.0,), ''), ((1.0,), ', as in most rows'))
     """
-    true = says_nominal(name)
-    words = [v for v in values if (str(v).lower() in _TRUE if true else _is_nominal_word(v))]
+    texts = {v: v.strip().lower() if isinstance(v, str) else "" for v in values}
+    words = [v for v, text in texts.items() if text in _SHORT or NOMINAL_WORDS.search(text)]
+    if says_nominal(name):
+        words = [v for v in values if str(v).lower() in _TRUE]
     if words and len(words) < len(values):
         return tuple(words), ""
     if 0.0 in values and -1.0 not in values:
@@ -188,11 +178,6 @@ def says_nominal(name: str) -> bool:
     """Tell whether the name of a label says that it is true of nominal rows."""
     plain = split_unit(name)[0].rpartition(".")[2].lower()
     return bool(re.fullmatch(r"(?:is[_ ]?)?(?:healthy|normal|nominal|ok|good|inlier)", plain))
-
-
-def _is_nominal_word(value: float | str) -> bool:
-    text = value if isinstance(value, str) else ""
-    return text.strip().lower() in _SHORT or bool(NOMINAL_WORDS.search(text))
 
 
 def plain_label(value: float | str) -> int | float | str:
@@ -250,14 +235,12 @@ class IntervalList:
 
     def __init__(self, intervals: Iterable[Interval], source: str) -> None:
         self._source = source
-        self._rows: dict[str, list[Interval]] = {}
-        self._unused: set[str] = set()
+        self._rows: dict[str, list[Interval]] = defaultdict(list)
         for interval in intervals:
-            rows = self._rows.setdefault(interval[0], [])
-            if interval in rows:
+            if interval in self._rows[interval[0]]:
                 raise TrajectoryError(f"{source} names {interval[0]!r} twice with the same rows")
-            rows.append(interval)
-            self._unused.add(interval[0])
+            self._rows[interval[0]].append(interval)
+        self._unused = {*self._rows}
 
     @classmethod
     def of(cls, recipe: Recipe, root: Path) -> "IntervalList":
@@ -289,13 +272,10 @@ class IntervalList:
         UsageError
             When an interval names a file that is cut: rows and times may be of any of its episodes.
         """
-        plain = path.name.removesuffix(".gz")
-        keys = dict.fromkeys(
-            [str(path), relative, path.name, plain, path.stem, Path(plain).stem, name]
-        )
         parts = Path(relative).parts
-        tails = ["/".join(parts[i:]) for i in range(1, len(parts))]
-        names = [key for key in dict.fromkeys([*keys, *tails]) if key in self._rows]
+        tails = ["/".join(parts[i:]) for i in range(len(parts))]
+        keys = dict.fromkeys([str(path), relative, *tails, path.stem, stem(path), name])
+        names = [key for key in keys if key in self._rows]
         self._unused -= {*names}
         if is_cut and (files := [key for key in names if key != name]):
             raise UsageError(
@@ -347,10 +327,9 @@ def read_intervals(path: Path) -> list[Interval]:
             )
         first, last = _moment(cells[start]), _moment(cells.get("stop", ""))
         intervals.append((cells["file"], first, last, cells.get("kind", "")))
-    names = [row[0] for row in intervals]
-    if start == "onset" and len({*names}) < len(names):
-        double = next(name for name in names if names.count(name) > 1)
-        raise TrajectoryError(f"{path} names {double!r} twice, expected one onset a file")
+    ((name, count),) = Counter(row[0] for row in intervals).most_common(1) or [("", 0)]
+    if start == "onset" and count > 1:
+        raise TrajectoryError(f"{path} names {name!r} twice, expected one onset a file")
     return intervals
 
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,11 +15,19 @@ from oodd_eval.data.parts import CALIBRATION, TRAIN, TWINS
 from oodd_eval.errors import TrajectoryError, UnknownNameError, UsageError
 from oodd_logs.kinds.times import orders_of, parse_times, past_midnight, unit_in
 from oodd_logs.ledger import Fate, Ledger
-from oodd_logs.marks import IntervalList, LabelValues, Mark, anomalous_cells, runs_of
+from oodd_logs.marks import (
+    IntervalList,
+    LabelCounts,
+    Mark,
+    anomalous_cells,
+    are_signed,
+    counted_labels,
+    runs_of,
+)
 from oodd_logs.readers.cells import mixed
 from oodd_logs.readers.packed import stem
 from oodd_logs.recipe import Recipe, anomaly_name
-from oodd_logs.recording import Column, Recording
+from oodd_logs.recording import Recording
 from oodd_logs.rows import TopicRows, read_column
 from oodd_logs.selecting import Selection, find_columns, layout_of, named_columns
 from oodd_logs.stamps import Steps, Stretch, Times, check_stamps, cut_at_gaps, on_grid, set_forward
@@ -71,16 +80,16 @@ class Recorded:
 
     def meeting(self, recipe: Recipe) -> "Recorded":
         """Return it with those of its roles whose conditions its values meet."""
-        kept = set()
-        for role in self.roles:
-            if role in NOMINAL_ROLES:
-                conditions = dict(recipe.nominal.where)
-                conditions.pop(recipe.kinds, None)  # other values name anomalies
-            else:
-                conditions = dict(recipe.anomalous[role.removeprefix("test/")].where)
-            if all(self.text(k) in map(text_of, values) for k, values in conditions.items()):
-                kept.add(role)
-        return dataclasses.replace(self, roles=frozenset(kept))
+        # Other values of kinds name anomalies.
+        nominal = {k: values for k, values in recipe.nominal.where.items() if k != recipe.kinds}
+        conditions = {f"test/{name}": table.where for name, table in recipe.anomalous.items()}
+        conditions |= dict.fromkeys(NOMINAL_ROLES, nominal)
+        kept = frozenset(
+            role
+            for role in self.roles
+            if all(self.text(k) in map(text_of, values) for k, values in conditions[role].items())
+        )
+        return dataclasses.replace(self, roles=kept)
 
     def text(self, name: str, *, last: bool = False) -> str:
         """Return the value of a field, or of a column: the only one, or that of the last row.
@@ -157,7 +166,7 @@ class StampedRows:
     ) -> None:
         self._recorded, self._selection = recorded, selection
         self._recipe, self._ledger = recipe, ledger
-        self.labels = LabelValues(recipe)
+        self.labels: LabelCounts = {}
         self.topics = {
             name: TopicRows(recorded.recording, name, selection, recipe, ledger, recorded.label)
             for name in selection.topics
@@ -179,7 +188,9 @@ class StampedRows:
             unit = column.quantity.unit
             if unit == "1" and len(self._selection.times[topic]) > 1:
                 unit = unit_in(column.column)
-            arguments = unit, self._order(cells), f"{source}, column {column.column!r}"
+            orders = orders_of(cells) if cells.dtype.kind == "U" and not self._recipe.dates else ()
+            order = orders[0] if len(orders) == 1 else self._recipe.dates
+            arguments = unit, order, f"{source}, column {column.column!r}"
             try:
                 times = _seconds(cells, *arguments)
             except TrajectoryError:
@@ -215,11 +226,6 @@ class StampedRows:
                 raise
             reason = str(error).removeprefix(f"{self._recorded.source}: ")
             self._ledger.add("mark", "dropped", reason, name=kind, source=self._recorded.label)
-
-    def _order(self, cells: Column) -> str:
-        """Return the order of day and month in dates, empty where it is not told."""
-        orders = orders_of(cells) if cells.dtype.kind == "U" and not self._recipe.dates else ()
-        return orders[0] if len(orders) == 1 else self._recipe.dates
 
     def stretches(self) -> tuple[list[Stretch], list[Times]]:
         """Return the rows that become episodes, on an even grid or as they are, and their stamps.
@@ -268,8 +274,7 @@ class StampedRows:
         used = {name: np.zeros(len(times), bool) for name, times in timed.items()}
         for first, last in cut_at_gaps(timed, recipe.gap, recipe.rate, source):
             inside = {n: (times >= first) & (times <= last) for n, times in timed.items()}
-            for name, rows_inside in inside.items():
-                used[name] |= rows_inside
+            used = {name: used[name] | mask for name, mask in inside.items()}
             if recipe.rate is None:
                 ((name, mask),) = inside.items()
                 rows = usable[name][mask]
@@ -291,11 +296,11 @@ class StampedRows:
     ) -> None:
         """Say which rows hold longer than one of the grid, or not at all, where rates agree."""
         steps = Steps.of(times).usual * (self._recipe.rate or 0.0)
-        repeated = numbers[1:][np.diff(numbers) == 0]
         if steps < SLOWER:
+            repeated = numbers[1:][np.diff(numbers) == 0]
             self._say("held", "longer than a row", rows[repeated], name=topic)
-        passed = np.setdiff1d(np.arange(numbers[0], numbers[-1]), numbers)
         if steps > 1 / SLOWER:
+            passed = np.setdiff1d(np.arange(numbers[0], numbers[-1]), numbers)
             self._say("dropped", "sooner than a row after others", rows[passed], name=topic)
 
     def marks(self, intervals: IntervalList, *, is_anomalous: bool) -> list[Mark]:
@@ -312,13 +317,13 @@ class StampedRows:
         marks = []
         for text, column in self._selection.labels.items():
             owners = [name for name, table in recipe.anomalous.items() if text in table.labels]
-            blocks = [np.zeros(0, np.bool_)]
+            blocks, counts = [np.zeros(0, np.bool_)], self.labels.setdefault(text, Counter())
             for start, cells in read_column(recorded.recording.topics[column.topic], column.column):
                 labels = self._labels(cells, start, column.column)
                 before = bool(blocks[-1][-1:].any())
                 blocks.append(anomalous_cells(labels, recipe, before=before))
-                self.labels.add(text, labels)
-            if recipe.missing == "keep" and self.labels.is_signed(text):
+                counts.update(counted_labels(labels))
+            if recipe.missing == "keep" and are_signed(counts, recipe):
                 continue  # a scan says so, and judges by no label
             marks += [
                 Mark(begin, end, kind)
@@ -328,19 +333,17 @@ class StampedRows:
                 if (begin := self._position(start, column.topic, "begin"))
                 < (end := self._position(stop, column.topic, "end"))
             ]
-        name, is_cut = recorded.recording.name, recorded.recording.name != stem(recorded.path)
-        is_cut = is_cut and bool(recipe.episode)
+        path, name = recorded.path, recorded.recording.name
+        is_cut = bool(recipe.episode) and name != stem(path)
         with self._scan_goes_on():
-            for _, first, stop, kind in intervals.of_recording(
-                recorded.path, name, recorded.relative, is_cut=is_cut
-            ):
+            listed = intervals.of_recording(path, name, recorded.relative, is_cut=is_cut)
+            for _, first, stop, kind in listed:
                 with self._scan_goes_on(kind):
-                    marks.append(self._listed(first, stop, kind and anomaly_name(kind)))
+                    marks.append(self._mark(first, stop, kind and anomaly_name(kind)))
         tables = {name: recipe.anomalous[name] for name in recorded.kinds}
         onsets = [(table.onset, table.stop, name) for name, table in tables.items()]
         onset = recorded.recording.fields.get("onset")
-        if onset is None and is_anomalous:
-            onset = recipe.onset
+        onset = recipe.onset if onset is None and is_anomalous else onset
         for first, stop, kind in (*onsets, (onset, recipe.stop, "")):
             if first is not None:
                 marks.append(self._mark(int(first), stop, kind))
@@ -361,31 +364,25 @@ class StampedRows:
             self._say("kept", reason, rows, cell=cell, name=name, item="cell")
         return cells if is_text.any() else numbers
 
-    def _listed(self, start: Any, stop: Any, kind: str) -> Mark:
+    def _mark(self, start: Any, stop: Any, kind: str) -> Mark:
         """Return the mark of an interval; `TrajectoryError` where the recording has none of it."""
-        mark, topic = self._mark(start, stop, kind), self._selection.topics[0]
-        if topic in self._stamps:
+        topic, expected = self._selection.topics[0], ""
+        begin = -np.inf if start is None else self._position(start, topic, "begin")
+        end = np.inf if stop is None else self._position(stop, topic, "end")
+        if not begin < end:
+            expected = "an end behind its start"
+        elif topic in self._stamps:
             times = self._stamps[topic]
-            if mark.stop <= np.nanmin(times) or mark.start > np.nanmax(times):
+            if end <= np.nanmin(times) or begin > np.nanmax(times):
                 columns = [column.column for column in self._selection.times[topic]]
                 cells = self._recorded.recording.topics[topic].read(columns, 0, len(times))
                 rows = np.flatnonzero(np.isfinite(times))[[0, -1]].tolist()
                 first, last = (" ".join(str(cells[name][i]) for name in columns) for i in rows)
-                raise TrajectoryError(
-                    f"{self._recorded.source}: an anomaly is from {start} to {stop}, expected a "
-                    f"part of the recording, whose first stamp is {first} and its last {last}"
-                )
-        return mark
-
-    def _mark(self, start: Any, stop: Any, kind: str) -> Mark:
-        topic = self._selection.topics[0]
-        begin = -np.inf if start is None else self._position(start, topic, "begin")
-        end = np.inf if stop is None else self._position(stop, topic, "end")
-        if not begin < end:
-            raise TrajectoryError(
-                f"{self._recorded.source}: an anomaly is from {start} to {stop}, expected an end "
-                "behind its start"
-            )
+                span = f"the recording, whose first stamp is {first} and its last {last}"
+                expected = f"a part of {span}"
+        if expected:
+            anomaly = f"{self._recorded.source}: an anomaly is from {start} to {stop}"
+            raise TrajectoryError(f"{anomaly}, expected {expected}")
         return Mark(begin, end, kind)
 
     def _position(self, moment: float | str, topic: str, side: str) -> float:
@@ -407,10 +404,9 @@ class StampedRows:
                 f"{source}: {moment!r} is a time, but there are no stamps: name their column with "
                 "time, or name rows, which are whole numbers"
             )
-        columns = self._selection.times[topic]
+        columns, dates = self._selection.times[topic], self._recipe.dates
         unit = columns[0].quantity.unit if len(columns) == 1 else ""
-        where = f"{source}: an anomaly"
-        time = float(_seconds(np.array([moment]), unit, self._recipe.dates, where)[0])
+        time = float(_seconds(np.array([moment]), unit, dates, f"{source}: an anomaly")[0])
         logged = self._logged[topic]
         if logged is stamps:
             return time
