@@ -79,10 +79,8 @@ def _counter(cells: Column) -> NDArray[np.float64] | None:
 def _starts_anew(name: str, counter: NDArray[np.float64]) -> bool:
     """Tell whether a column rises, in even steps or as its name says, but for a few falls."""
     steps = np.diff(counter)
-    rising = steps[steps > 0]
-    if not 1 <= (steps < 0).sum() <= len(steps) / _SHORTEST or len(rising) < _STEADY * (
-        len(steps) - (steps < 0).sum()
-    ):
+    rising, falls = steps[steps > 0], int((steps < 0).sum())
+    if not 1 <= falls <= len(steps) / _SHORTEST or len(rising) < _STEADY * (len(steps) - falls):
         return False
     is_even = (np.abs(rising - np.median(rising)) <= 1e-3 * np.median(rising)).mean() >= _STEADY
     return bool(is_even or COUNTS.search(_words(name)))
@@ -108,12 +106,9 @@ def _keys(topic: Topic, sample: Mapping[str, Column], restarts: Mapping[str, _Ma
             continue
         partner = [] if len(distinct) == episodes else _partner(sample, name, changes)
         if partner is not None and (explains or not partner):
-            ranked.append((not says_so, not _counts_up(values), [*partner, name]))
+            counts_up = values.dtype.kind == "f" and bool((np.diff(values) == 1).all())
+            ranked.append((not says_so, not counts_up, [*partner, name]))
     return min(ranked, key=lambda row: row[:2], default=(True, True, []))[2]
-
-
-def _counts_up(values: Column) -> bool:
-    return values.dtype.kind == "f" and bool((np.diff(values) == 1).all())
 
 
 def _partner(sample: Mapping[str, Column], name: str, changes: _Mask) -> list[str] | None:
@@ -121,14 +116,9 @@ def _partner(sample: Mapping[str, Column], name: str, changes: _Mask) -> list[st
     rows = np.append(0, np.flatnonzero(changes) + 1)
     rows = rows[rows < len(sample[name])]
     for other, cells in sample.items():
-        if (
-            other == name
-            or len(cells) <= rows[-1]
-            or ((cells[1:] != cells[:-1]) > changes[: len(cells) - 1]).any()
-        ):
-            continue
+        is_within = ((cells[1:] != cells[:-1]) <= changes[: len(cells) - 1]).all()
         pairs = {*zip(cells[rows].tolist(), sample[name][rows].tolist(), strict=True)}
-        if len(pairs) == len(rows):
+        if other != name and is_within and len(pairs) == len(rows):
             return [other]
     return None
 
@@ -137,10 +127,10 @@ def _flags(topic: Topic) -> list[str]:
     """Return flags of last rows, else of first ones."""
     for names in (ENDS, BEGINS):
         columns = [name for name in topic.names if last_part(name) in names]
-        cells = topic.read(columns, 0, topic.rows) if columns else {}
-        set_before_end = [n for n, x in cells.items() if _is_flag(x) and (x[1:-1] == 1).any()]
-        if set_before_end:
-            return [n for n, x in cells.items() if n in set_before_end or (_is_flag(x) and x.any())]
+        cells = topic.read(columns, 0, topic.rows)
+        flags = [name for name in columns if _is_flag(cells[name])]
+        if any((cells[name][1:-1] == 1).any() for name in flags):
+            return flags
     return []
 
 
@@ -148,8 +138,7 @@ def _is_flag(cells: Column) -> bool:
     """Tell whether cells are 0 but for single rows of 1."""
     if cells.dtype.kind == "U" or not np.isin(cells, [0, 1]).all():
         return False
-    flagged = cells == 1
-    return not (flagged[1:] & flagged[:-1]).any()
+    return bool(cells.any()) and not (cells[1:] * cells[:-1]).any()
 
 
 def _in_turn(
@@ -157,36 +146,25 @@ def _in_turn(
 ) -> list[str]:
     """Return the column that names who wrote each row, where several write in turn."""
     # Their stamps do not rise from row to row, but from each one's row to the next.
-    group = _codes([sample[name] for name in keys if name in sample])
+    groups = [sample[name] for name in keys]
     clocks = [x for name, x in counters.items() if COUNTS.search(_words(name))]
-    unclear = [x for x in clocks if _rising(x, group) < 1 - _IN_TURN]
+    unclear = [x for x in clocks if _rising(x, groups) < 1 - _IN_TURN]
     for name, cells in sample.items():
         _, counts = np.unique(cells, return_counts=True)
         is_key = name not in keys and not _NO_KEY.search(_words(name))
         if not is_key or not 1 < len(counts) <= len(cells) / _SHORTEST:
             continue
         takes_turns = (cells[1:] != cells[:-1]).mean() >= _STEADY and max(counts) < 2 * min(counts)
-        codes = _codes([sample[n] for n in keys if n in sample] + [cells])
         if (takes_turns and _WRITER.search(_words(name))) or any(
-            _rising(x, codes) == 1 for x in unclear
+            _rising(x, [*groups, cells]) == 1 for x in unclear
         ):
             return [name]
     return []
 
 
-def _codes(columns: Sequence[Column]) -> NDArray[np.intp] | None:
-    """Return the number of each row's combination of values; None without columns."""
-    codes = None
-    for cells in columns:
-        values, inverse = np.unique(cells, return_inverse=True)
-        codes = inverse if codes is None else codes * len(values) + inverse
-    return codes
-
-
-def _rising(counter: Column, group: NDArray[np.intp] | None) -> float:
-    """Return the share of rows with more than the row before in their group."""
-    if group is None:
-        return float((np.diff(counter) > 0).mean())
-    order = np.argsort(group, kind="stable")
-    same = np.diff(group[order]) == 0
+def _rising(counter: Column, groups: Sequence[Column]) -> float:
+    """Return the share of rows with more than the row before that has the same cells in groups."""
+    columns = [np.zeros(len(counter)), *groups]
+    order = np.lexsort(columns)
+    same = np.all([cells[order][1:] == cells[order][:-1] for cells in columns], axis=0)
     return float((np.diff(counter[order]) > 0)[same].mean()) if same.any() else 0.0

@@ -3,7 +3,7 @@
 import gzip
 import io
 from pathlib import Path
-from typing import Final, TextIO
+from typing import Any, Final, TextIO
 
 from oodd_eval.data.bounded import EPISODE
 
@@ -17,7 +17,7 @@ def stem(path: Path) -> str:
     return Path(path.name.removesuffix(".gz")).stem
 
 
-def open_bytes(path: Path) -> gzip.GzipFile | io.BufferedReader:
+def open_bytes(path: Path) -> io.BufferedReader:
     """Open a file for reading; its first bytes tell whether it is packed.
 
     Reading raises `TrajectoryError` where it unpacks to more than a log does.
@@ -28,11 +28,12 @@ def open_bytes(path: Path) -> gzip.GzipFile | io.BufferedReader:
         file.seek(max(0, path.stat().st_size - 4))
         size = int.from_bytes(file.read(), "little")
     unpacked = _Unpacked(path)
+    file = io.BufferedReader(unpacked, 2**17)
     if size > unpacked.most:  # or its end is cut: both are found here, before rows are
-        while unpacked.read1(2**20):
+        while file.read(2**20):
             pass
-        unpacked.seek(0)
-    return unpacked
+        file.seek(0)
+    return file
 
 
 def open_text(path: Path, encoding: str) -> TextIO:
@@ -57,24 +58,10 @@ class _Unpacked(gzip.GzipFile):
         super().__init__(path, "rb")
         self.most = min(_LARGEST, max(_SOME, _RATIO * path.stat().st_size))
 
-    def _check(self) -> None:
+    def readinto(self, buffer: Any) -> int:
+        """Read some bytes into a buffer."""
+        content = self.read(len(buffer))
         if self.tell() > self.most:
             raise EPISODE.failure(f"{self.name} unpacks to more than {self.most} bytes")
-
-    def read(self, size: int | None = -1) -> bytes:
-        """Return some bytes, or all."""
-        content = super().read(self.most + 1 if size is None or size < 0 else size)
-        self._check()
-        return content
-
-    def read1(self, size: int = -1) -> bytes:
-        """Return at most some bytes."""
-        content = super().read1(size)
-        self._check()
-        return content
-
-    def readline(self, size: int | None = -1) -> bytes:
-        """Return a line, or its beginning."""
-        content = super().readline(-1 if size is None else size)
-        self._check()
-        return content
+        buffer[: len(content)] = content
+        return len(content)
