@@ -113,9 +113,8 @@ class Recorded:
         if last:
             cells = topic.read([column], topic.rows - 1, topic.rows)[column]
             return text_of(cells[-1].item())
-        distinct: set[str] = set()
-        for _start, cells in read_column(topic, column):
-            distinct |= {*map(text_of, np.unique(cells).tolist()[:5])}
+        blocks = (np.unique(cells).tolist()[:5] for _start, cells in read_column(topic, column))
+        distinct = {text_of(value) for values in blocks for value in values}
         if len(distinct) != 1:
             values = ", ".join(sorted(distinct)[:3]) or "no value"
             raise TrajectoryError(
@@ -351,11 +350,12 @@ class StampedRows:
 
     def _labels(self, cells: NDArray[Any], start: int, name: str) -> NDArray[Any]:
         """Return labels, as numbers where they are; say which are missing, or other texts."""
-        numbers, is_text = mixed(cells) if cells.dtype.kind == "U" else (cells, np.isnan(cells) < 0)
-        present = np.isfinite(numbers)
-        absent = ~present & ~is_text
-        if not present.any():
+        numbers, is_text = (
+            mixed(cells) if cells.dtype.kind == "U" else (cells, np.zeros(len(cells), bool))
+        )
+        if not np.isfinite(numbers).any():
             return cells
+        absent = ~np.isfinite(numbers) & ~is_text
         if 2 * absent.sum() < len(cells):
             self._say("held", "no label", start + np.flatnonzero(absent), name=name, item="cell")
         if 2 * is_text.sum() < len(cells):
@@ -387,16 +387,16 @@ class StampedRows:
 
     def _position(self, moment: float | str, topic: str, side: str) -> float:
         """Return where a row or time is: in seconds, or rows without stamps."""
-        source, rows = self._recorded.source, self._recorded.recording.topics[topic].rows
-        stamps, most = self._stamps.get(topic), rows - (side == "begin")
+        source, count = self._recorded.source, self._recorded.recording.topics[topic].rows
+        stamps, most = self._stamps.get(topic), count - (side == "begin")
         if isinstance(moment, int):
             if not 0 <= moment <= most:
                 raise TrajectoryError(
                     f"{source}: an anomaly is said to {side} at row {moment}, expected 0 to "
-                    f"{most}, as there are {rows} rows"
+                    f"{most}, as there are {count} rows"
                 )
             if stamps is None:
-                return float(moment) if moment < rows else np.inf
+                return float(moment) if moment < count else np.inf
             later = stamps[moment:]
             return float(next(iter(later[np.isfinite(later)]), np.inf))
         if stamps is None:
@@ -408,11 +408,9 @@ class StampedRows:
         unit = columns[0].quantity.unit if len(columns) == 1 else ""
         time = float(_seconds(np.array([moment]), unit, dates, f"{source}: an anomaly")[0])
         logged = self._logged[topic]
-        if logged is stamps:
-            return time
         # Where the clock was set back, a time is that of the first rows that have it.
-        row = [*np.flatnonzero(logged >= time), np.flatnonzero(np.isfinite(logged))[-1]][0]
-        return float(stamps[row] + time - logged[row])
+        rows = np.append(np.flatnonzero(logged >= time), np.flatnonzero(np.isfinite(logged))[-1:])
+        return float(time + (stamps - logged)[rows[:1]].sum())
 
 
 def _tolerant(cells: NDArray[Any], unit: str, order: str, source: str) -> Times:

@@ -27,20 +27,15 @@ from oodd_logs.recording import MISSING, Column, Recording, Topic
 from oodd_logs.rows import read_column
 from oodd_logs.selecting import find_columns, layout_of, named_columns
 
-TERMINAL: Final = frozenset(
-    {"terminal", "terminals", "terminated", "termination", "terminations", "is_terminal"}
-)
+TERMINAL: Final = re.compile(r"(?:is_)?termina(?:ls?|ted|tions?)")
 """Names of flags, in lower case, in the last row of an episode that ended of its own."""
 
-ENDS: Final = TERMINAL | {
-    *("timeout", "timeouts", "truncated", "truncation", "truncations", "done", "dones", "is_done"),
-    *("last", "is_last", "end", "is_end", "episode_end", "episode_ends"),
-}
+ENDS: Final = re.compile(
+    rf"{TERMINAL.pattern}|timeouts?|truncat(?:ed|ions?)|(?:is_)?(?:dones?|last|end)|episode_ends?"
+)
 """Names of flags in the last row of an episode."""
 
-BEGINS: Final = frozenset(
-    {"first", "is_first", "start", "is_start", "reset", "episode_start", "episode_starts"}
-)
+BEGINS: Final = re.compile(r"(?:is_)?(?:first|start)|reset|episode_starts?")
 """Names of flags in the first row of an episode."""
 
 COUNTS: Final = re.compile(
@@ -131,7 +126,8 @@ def split_recording(
         )
     marked, ledger = recording.topics[main], Ledger()
     ledger.merge(recording.ledger)
-    runs = [_Runs.of(marked, column.column) for (column,) in matches.values()]
+    keys = dict.fromkeys(column.column for (column,) in matches.values())
+    runs = [_Runs.of(marked, name) for name in keys]
     episodes = _episodes(recording.source, runs, ledger)
     parts = {main: [rows for _, _, rows in episodes]}
     parts |= _by_stamps(recording, main, parts[main], ledger)
@@ -140,7 +136,7 @@ def split_recording(
     topics = {**recording.topics, main: dataclasses.replace(marked, names=names)}
     topics = {name: _held(topic, parts[name]) for name, topic in topics.items()}
     for i, (title, fields, _) in enumerate(episodes):
-        ended = [bool(value) for name, value in fields.items() if last_part(name) in TERMINAL]
+        ended = [bool(value) for name, value in fields.items() if names_flag(TERMINAL, name)]
         terminated = {"terminated": any(ended)} if ended else {}
         yield dataclasses.replace(
             recording,
@@ -194,8 +190,10 @@ class _Runs:
             return "key"
         distinct = np.unique(self.values[np.isfinite(self.values)])
         if {*distinct.tolist()} <= {0.0, 1.0}:
-            if last_part(self.name) in BEGINS | ENDS:
-                return "begins" if last_part(self.name) in BEGINS else "ends"
+            if names_flag(ENDS, self.name):
+                return "ends"
+            if names_flag(BEGINS, self.name):
+                return "begins"
             lengths = np.diff(np.append(self.starts, self.rows))
             if lengths[self.values == 1].max(initial=0) == 1 < lengths.max():
                 return "begins" if self.values[0] == 1 else "ends"
@@ -207,9 +205,9 @@ class _Runs:
         return "counter" if counts and rising >= _STEADY * (self.rows - 1) else "key"
 
 
-def last_part(name: str) -> str:
-    """Return the last part of a name, in lower case: ``done`` of ``next.done``."""
-    return re.split(r"[./:]", name)[-1].strip().lower()
+def names_flag(pattern: re.Pattern[str], name: str) -> bool:
+    """Tell whether the last part of a name, such as ``done`` of ``next.done``, is one of flags."""
+    return bool(pattern.fullmatch(re.split(r"[./:]", name)[-1].strip().lower()))
 
 
 def _episodes(

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from oodd_logs.inspection.columns import parse_dates
 from oodd_logs.kinds.times import names_time, pairs_of
 from oodd_logs.recording import Column, Recording, Topic
-from oodd_logs.splitting import BEGINS, COUNTS, ENDS, last_part
+from oodd_logs.splitting import BEGINS, COUNTS, ENDS, names_flag
 
 _CELLS: Final = 1 << 20  # that are looked at
 _SHORTEST: Final = 8  # rows of an episode, in the mean
@@ -125,8 +125,8 @@ def _partner(sample: Mapping[str, Column], name: str, changes: _Mask) -> list[st
 
 def _flags(topic: Topic) -> list[str]:
     """Return flags of last rows, else of first ones."""
-    for names in (ENDS, BEGINS):
-        columns = [name for name in topic.names if last_part(name) in names]
+    for pattern in (ENDS, BEGINS):
+        columns = [name for name in topic.names if names_flag(pattern, name)]
         cells = topic.read(columns, 0, topic.rows)
         flags = [name for name in columns if _is_flag(cells[name])]
         if any((cells[name][1:-1] == 1).any() for name in flags):
