@@ -153,6 +153,7 @@ def test_a_wrong_option_is_refused_with_what_is_expected(tmp_path, options, mess
         (["1,013.5", "999", "7.25"], [1013.5, 999, 7.25], "stands between thousands"),
         (["1'013", "999", "7.25"], [1013, 999, 7.25], ""),
         (["1\u202f013", "999", "7"], [1013, 999, 7], ""),
+        (["1.5D+03", "45 %", "7"], [1500, 45, 7], ""),
         (["1.5", "#N/A", "2"], [1.5, np.nan, 2], "1 cell of x, a code for what is missing: "),
         (["-nan(ind)", "1.#QNAN", "2"], [np.nan, np.nan, 2], "-nan(ind)"),
         (["?", "-", "2"], [np.nan, np.nan, 2], "row 0"),
@@ -192,6 +193,11 @@ def test_a_mark_between_thousands_may_be_said(tmp_path):
         ("t,x\n0,1\n2,\0\0\0\0" + "4\n5,6\n", {"t": [0, 5], "x": [1, 6]}, "zero bytes are in its"),
         ("t,x\n0,1\n2,3\n4", {"t": [0, 2], "x": [1, 3]}, "the last line is cut"),
         ("t,x\n0,1\n2,3\n4\n", {"t": [0, 2, 4], "x": [1, 3, np.nan]}, ""),
+        ("t,x\n0,1\n# pump\n2,3\n", {"t": [0, 2], "x": [1, 3]}, "a remark between rows"),
+        ("t,x\n0,1\nt,x\n2,3\n", {"t": [0, 2], "x": [1, 3]}, "the header again"),
+        ('t,x,n\n0,1,a\n1,"2,b\n2,3,c\n3,4,d\n',
+         {"t": [0, 1, 2, 3], "x": ["1", '"2', "3", "4"], "n": [*"abcd"]}, "never closed"),
+        ("x,x\n0,1\n", {"x": [0], "x (2)": [1]}, "'x' stands twice"),
         ("obs:x,action:u\n0,1\n2", {"obs:x": [0, 2], "action:u": [1, np.nan]}, ""),
     ],
 )  # fmt: skip
@@ -242,6 +248,7 @@ def many_members(count):
     [
         ("x.csv", b"t,x\n0,1\n1,2,3\n4,5\n", "line 3 has 3 cells, expected 2"),
         ("x.csv", b"t,x\n0\n1,2\n", "line 2 has 1 cells"),
+        ("x.csv", b"t,x\n0,1\nx,t\n1,2\n", "line 3 is a header of another order"),
         ("x.csv", b't,n\n0,"a\nb"\n1,2,3\n4,5', "line 4 has 3 cells"),
         ("x.csv", b"PK\x00\x03\x04", "is no text"),
         ("x.csv", b"", "x.csv is empty"),
@@ -685,6 +692,10 @@ def test_arrays_without_observations_are_a_table(tmp_path):
     np.save(tmp_path / "run.npy", np.arange(10.0).reshape(5, 2))
     assert rows(table("numpy", tmp_path / "run.npy"))["obs:sensor 1"] == [1, 3, 5, 7, 9]
     turned = table("numpy", tmp_path / "run.npy", transpose=["run.*"])
+    np.save(tmp_path / "demos.npy", np.arange(24.0).reshape(2, 4, 3))
+    first, second = recordings("numpy", tmp_path / "demos.npy")
+    assert (first.name, second.name, first.topics[""].rows) == ("demos-0", "demos-1", 4)
+    assert rows(second.topics[""])["obs:sensor 0"] == [12, 15, 18, 21]
     assert (turned.rows, len(turned.names)) == (2, 5)
 
 
@@ -873,6 +884,8 @@ def check_imu(topic, *, stamps=True):
         ({"at": {"nanosec": 500_000_000, "sec": 7}}, {"at": 7.5}),
         ({"at": {"nanos": 250_000_000, "seconds": "7"}}, {"at": 7.25}),
         ({"at": {"seconds": 7, "phase": 1}}, {"at.seconds": 7, "at.phase": 1}),
+        ({"name": ["a"], "hits": [{"x": 1}], "values": [1, 2]},
+         {"name.0": "a", "hits.0.x": 1, "values.0": 1, "values.1": 2}),
         ({"name": ["hip", "knee"], "position": [1, 2], "effort": []},
          {"position.hip": 1, "position.knee": 2}),
         ({"joint_names": ["hip", "knee"], "points": [{"positions": [1, 2]}, {"positions": [3, 4]}]},
@@ -893,7 +906,9 @@ def test_values_in_messages_have_names_and_not_places(message, columns):
     gathered = Gathered("run")
     gathered.add(message)
     cells = rows(gathered.topic())
-    assert {name: cell[0] for name, cell in cells.items()} == pytest.approx(columns, nan_ok=True)
+    assert {*cells} == {*columns}
+    for name, value in columns.items():
+        assert cells[name][0] == pytest.approx(value, nan_ok=True)
     left_out = {entry.name for entry in gathered.ledger.of("column", "dropped")}
     assert left_out == {"image", "data", "text"} & {*message}
     assert {e.name for e in gathered.ledger.of("column", "changed")} == {"ranges"} & {*message}

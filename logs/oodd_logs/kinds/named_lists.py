@@ -37,6 +37,10 @@ def _beside_names(name: str, value: Mapping[str, Any]) -> Pairs | None:
         return None
     names = fitting[0]
     items = _labels(value[names])
+    others = [v for k, v in value.items() if k not in naming and _is_list(v) and len(v)]
+    plain = [v for v in others if not isinstance(v[0], Mapping)]
+    if any(len(v) != len(items) for v in plain):  # those of equal length are so by chance
+        return None
     made = [(key, _named(inner, items)) for key, inner in value.items() if key != names]
     if not any(inner is not value[key] for key, inner in made):
         return None

@@ -1,4 +1,7 @@
-"""Numbers with marks between thousands: ``1,013.5``, ``1.013,5``, ``1'013`` and ``1 013``."""
+"""Numbers with marks between thousands: ``1,013.5``, ``1.013,5``, ``1'013`` and ``1 013``.
+
+Those of Fortran, ``1.5D+03``, and in percent are numbers, too.
+"""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -17,6 +20,9 @@ _GROUPED: Final = {
     mark: re.compile(rf"[+-]?\d{{1,3}}(?:{re.escape(mark)}\d{{3}})+(?:([.,])\d+)?(?:[eE][+-]?\d+)?")
     for mark in MARKS
 }
+_OTHER: Final = re.compile(
+    r"([+-]?\d*\.?\d+|[+-]?\d+\.)(?:[dD]([+-]?\d{1,3})| ?%)"
+)  # 1.5D+03, 45 %
 _SINGLE: Final = 1000  # a number without a mark is below
 
 
@@ -40,6 +46,8 @@ def _read(texts: Sequence[str]) -> Mapping[str, float]:
     numbers = {}
     for text in texts:
         plain = text.strip().translate(_BLANKS)
+        if match := _OTHER.fullmatch(plain):
+            numbers[text] = float(f"{match[1]}e{match[2] or 0}")
         for mark in MARKS:
             match = _GROUPED[mark].fullmatch(plain)
             sure = mark in "' " or plain.count(mark) > 1 or (match and match[1])

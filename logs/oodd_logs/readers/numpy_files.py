@@ -22,11 +22,24 @@ def _open(path: Path, options: Options) -> Iterator[Recording]:
     arrays = {"observations": _array(path)} if path.suffix == ".npy" else read_npz(path, _BOUNDS)
     if is_transposed(path, options):
         arrays = {name: a.T if a.ndim == 2 else a for name, a in arrays.items()}
-    topic, fields, ledger = episode_of(cast("Mapping[str, MatrixRows]", arrays), str(path))
-    for name in ("onset", "seed"):
-        if name in fields:
-            fields[name] = whole_number(str(path), name, fields[name])
-    yield Recording(path.stem, str(path), {"": topic}, fields, ledger)
+    name = next((n for n in arrays if n.startswith("obs")), "")
+    count, rows, *more = arrays[name].shape if name else (0, 0)
+    stacked = {n: a for n, a in arrays.items() if a.ndim and len(a) == count}
+    if len(more) == 1 and all(a.ndim > 1 and rows - a.shape[1] in {0, 1} for a in stacked.values()):
+        # The first axis is one of episodes, the second one of rows.
+        for i in range(count):
+            episode = {n: a[i] if n in stacked else a for n, a in arrays.items()}
+            yield _recording(f"{path.stem}-{i}", f"{path}, episode {i}", episode)
+    else:
+        yield _recording(path.stem, str(path), arrays)
+
+
+def _recording(name: str, source: str, arrays: Mapping[str, Any]) -> Recording:
+    topic, fields, ledger = episode_of(cast("Mapping[str, MatrixRows]", arrays), source)
+    for field in ("onset", "seed"):
+        if field in fields:
+            fields[field] = whole_number(source, field, fields[field])
+    return Recording(name, source, {"": topic}, fields, ledger)
 
 
 def _array(path: Path) -> Any:

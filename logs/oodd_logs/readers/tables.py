@@ -74,6 +74,8 @@ class Layout:
         What stands between thousands: empty for nothing, None where columns tell.
     units
         Cells of a line with units below the header, of those of which `names` have them.
+    header
+        Names as they stand in the file; none where no line has any.
     """
 
     separator: str
@@ -83,6 +85,7 @@ class Layout:
     names: tuple[str, ...]
     thousands: str | None = None
     units: tuple[str, ...] = ()
+    header: tuple[str, ...] = ()
 
     def split(self, lines: Sequence[str]) -> list[list[str]]:
         """Return the cells of lines; lines without any are left out."""
@@ -114,6 +117,11 @@ def table_recording(path: Path, options: Options, separator: str = "") -> Record
     else:
         layout = layout_of(path, options, separator)
         topic = Topic.of(_table(path, layout, ledger))
+        for name in {*topic.names} - {*layout.header}:
+            if (match := re.fullmatch(r"(.+) \(\d+\)", name)) and layout.header.count(match[1]) > 1:
+                ledger.add(
+                    "column", "changed", f"{match[1]!r} stands twice in the header", name=name
+                )
         if layout.units:
             said = f"units of the columns, it seems: {', '.join(layout.units)}"[:200]
             ledger.add("row", "changed", f"{said} ([read] units = false keeps the line as a row)")
@@ -250,7 +258,8 @@ def layout_of(path: Path, options: Options, separator: str = "") -> Layout:
     thousands = _thousands(options, mark_of_cells)
     if thousands and decimal in {thousands, ""}:
         decimal = "," if thousands == "." else "."
-    return Layout(mark_of_cells, decimal, encoding, first, labels, thousands, tuple(units))
+    raw = tuple(cell.strip() for cell in head) if header else ()
+    return Layout(mark_of_cells, decimal, encoding, first, labels, thousands, tuple(units), raw)
 
 
 def _thousands(options: Options, separator: str) -> str | None:
@@ -366,7 +375,8 @@ class _Block:
         fast = None if worded else self._numbers()
         if fast is not None:
             return fast
-        rows = self.layout.split(io.StringIO(self.text).readlines())
+        lines = io.StringIO(self.text).readlines()
+        rows = self.layout.split(lines)
         if self.last:
             while rows and not any(rows[-1]):
                 rows.pop()
@@ -374,11 +384,19 @@ class _Block:
                 cell = self.layout.separator.join(rows.pop())
                 self.ledger.add("row", "dropped", "the last line is cut", cell=cell)
         width = len(self.layout.names)
-        if {*map(len, rows)} - {width}:
-            rows = [
-                row if len(row) == width else self._fitted(row, i, self.last and i == len(rows) - 1)
-                for i, row in enumerate(rows)
+        if '"' in self.text and any("\n" in cell for row in rows for cell in row):
+            plain = [
+                line.rstrip("\r\n").split(self.layout.separator) for line in lines if line.strip()
             ]
+            if {*map(len, plain)} == {width}:
+                rows = plain
+                self.ledger.add("row", "changed", "a quote that is never closed stands for itself")
+        pairs = enumerate(rows)
+        rows = [
+            self._fitted(row, i, self.last and i == len(rows) - 1)
+            for i, row in pairs
+            if not self._is_remark(row, i)
+        ]
         columns: list[_Cells] = []
         for i, cells in enumerate(zip(*rows, strict=True)):
             column = None if i in worded else numbers(cells, self.layout.decimal, strict=True)
@@ -418,10 +436,29 @@ class _Block:
         ended = self.text.endswith("\n") or all(n.startswith(_LAST) for n in lacking)
         return not ended
 
+    def _is_remark(self, row: list[str], i: int) -> bool:
+        """Tell whether a row is a remark between rows, or the header again; note it."""
+        header, reason = self.layout.header, ""
+        cells = [cell.strip() for cell in row] if row[0].strip() in header else []
+        if len(row) != len(self.layout.names) and row[0].startswith(("#", "%")):
+            reason = "a remark between rows"
+        elif header and cells == [*header]:
+            reason = "the header again"
+        elif len(header) > 1 and sorted(cells) == sorted(header):
+            line = self.line + _line_of(self.text, i, self.layout.separator)
+            raise TrajectoryError(
+                f"{self.path}, line {line} is a header of another order: split it"
+            )
+        if reason:
+            self.ledger.add("row", "dropped", reason, cell=self.layout.separator.join(row))
+        return bool(reason)
+
     def _fitted(self, row: list[str], i: int, end: bool) -> list[str]:
         """Return a row with as many cells as the header; empty cells may be missing at the end."""
         names = self.layout.names
         width = len(names)
+        if len(row) == width:
+            return row
         needed = max((k for k, n in enumerate(names, 1) if n != f"column {k}"), default=width)
         if len(row) < width and (end or len(row) >= needed):
             return row + [""] * (width - len(row))
