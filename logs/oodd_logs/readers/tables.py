@@ -258,8 +258,8 @@ def layout_of(path: Path, options: Options, separator: str = "") -> Layout:
     thousands = _thousands(options, mark_of_cells)
     if thousands and decimal in {thousands, ""}:
         decimal = "," if thousands == "." else "."
-    raw = tuple(cell.strip() for cell in head) if header else ()
-    return Layout(mark_of_cells, decimal, encoding, first, labels, thousands, tuple(units), raw)
+    written = tuple(cell.strip() for cell in head) if header else ()
+    return Layout(mark_of_cells, decimal, encoding, first, labels, thousands, tuple(units), written)
 
 
 def _thousands(options: Options, separator: str) -> str | None:
