@@ -1195,6 +1195,12 @@ def test_tables_of_other_columns_in_a_json_file_are_topics(tmp_path):
     assert topics({"observations": [T, A], "actions": [[1.0]]}) == {
         "": (*(f"obs:sensor {i}" for i in range(4)), "action:action 0")
     }
+    arm = {"q": A, "gains": [1, 2], "joint": 3}
+    (recording,) = recordings(
+        "json", written(tmp_path, json.dumps({"imu": {"x": T}, "arm": arm}), "x.json")
+    )
+    assert recording.fields == {"arm.joint": 3}
+    assert "column gains" in "\n".join(recording.ledger.lines())
 
 
 @pytest.mark.parametrize(

@@ -144,9 +144,14 @@ def _episodes(value: Any, source: str, depth: int = 0) -> Iterator[Recording]:
     ledger = Ledger()
     fields = _fields(value, source, inner, ledger) if isinstance(value, dict) else {}
     tables = {key: episodes[0] for key, episodes in inner.items() if len(episodes) == 1}
-    if len({*map(_columns, tables.values())}) == len(tables) == len(inner) > 1:
+    names = {frozenset(n for t in r.topics.values() for n in t.names) for r in tables.values()}
+    if len(names) == len(tables) == len(inner) > 1:
         # Tables of different columns are topics of one recording.
-        topics = {key: table.topics[""] for key, table in tables.items()}
+        topics = {}
+        for key, r in tables.items():
+            topics |= {".".join(filter(None, [key, n])): topic for n, topic in r.topics.items()}
+            fields |= {f"{key}.{name}": v for name, v in r.fields.items()}
+            ledger.merge(r.ledger)
         if len({topic.rows for topic in topics.values()}) == 1:
             cells = {k: t.read(t.names, 0, t.rows).items() for k, t in topics.items()}
             topics = {"": Topic.of({f"{k}.{n}": x for k, block in cells.items() for n, x in block})}
@@ -161,10 +166,6 @@ def _episodes(value: Any, source: str, depth: int = 0) -> Iterator[Recording]:
 
 def _rows(recording: Recording) -> int:
     return max(topic.rows for topic in recording.topics.values())
-
-
-def _columns(recording: Recording) -> tuple[str, ...]:
-    return tuple(sorted(name for topic in recording.topics.values() for name in topic.names))
 
 
 def _listed(value: Any) -> Any:
