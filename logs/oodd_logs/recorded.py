@@ -281,7 +281,13 @@ class StampedRows:
             else:
                 stretch = on_grid(timed, first, last, recipe.rate, source)
                 for name, numbers in stretch.sources.items():
-                    self._say_of_grid(name, timed[name], usable[name], numbers)
+                    rows, steps = usable[name], Steps.of(timed[name]).usual * recipe.rate
+                    if steps < SLOWER:  # rates agree
+                        repeated = rows[numbers[1:][np.diff(numbers) == 0]]
+                        self._say("held", "longer than a row", repeated, name=name)
+                    if steps > 1 / SLOWER:
+                        passed = rows[np.setdiff1d(np.arange(numbers[0], numbers[-1]), numbers)]
+                        self._say("dropped", "sooner than a row after others", passed, name=name)
                 sources = {n: usable[n][numbers] for n, numbers in stretch.sources.items()}
                 stretches.append(dataclasses.replace(stretch, sources=sources))
         cuts = [stretch.sources[name][:1] for stretch in stretches[1:]]
@@ -289,18 +295,6 @@ class StampedRows:
         for name, mask in used.items():
             self._say("dropped", "where another topic has none", usable[name][~mask], name=name)
         return stretches, [*timed.values()]
-
-    def _say_of_grid(
-        self, topic: str, times: Times, rows: NDArray[np.int64], numbers: NDArray[np.int64]
-    ) -> None:
-        """Say which rows hold longer than one of the grid, or not at all, where rates agree."""
-        steps = Steps.of(times).usual * (self._recipe.rate or 0.0)
-        if steps < SLOWER:
-            repeated = numbers[1:][np.diff(numbers) == 0]
-            self._say("held", "longer than a row", rows[repeated], name=topic)
-        if steps > 1 / SLOWER:
-            passed = np.setdiff1d(np.arange(numbers[0], numbers[-1]), numbers)
-            self._say("dropped", "sooner than a row after others", rows[passed], name=topic)
 
     def marks(self, intervals: IntervalList, *, is_anomalous: bool) -> list[Mark]:
         """Return the anomalous rows, in seconds where there are stamps.

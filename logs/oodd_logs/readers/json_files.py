@@ -138,7 +138,8 @@ def _episodes(value: Any, source: str, depth: int = 0) -> Iterator[Recording]:
             if isinstance(_listed(v), kinds):
                 inner[str(key)] = [*_episodes(v, f"{source}, {key}", depth + 1)]
     inner = {key: episodes for key, episodes in inner.items() if episodes}
-    if table and all(_rows(r) <= _rows(table) for episodes in inner.values() for r in episodes):
+    below = [topic.rows for rs in inner.values() for r in rs for topic in r.topics.values()]
+    if table and max(below, default=0) <= table.topics[""].rows:
         yield table
         return
     ledger = Ledger()
@@ -147,7 +148,7 @@ def _episodes(value: Any, source: str, depth: int = 0) -> Iterator[Recording]:
     names = {frozenset(n for t in r.topics.values() for n in t.names) for r in tables.values()}
     if len(names) == len(tables) == len(inner) > 1:
         # Tables of different columns are topics of one recording.
-        topics = {}
+        topics: dict[str, Topic] = {}
         for key, r in tables.items():
             topics |= {".".join(filter(None, [key, n])): topic for n, topic in r.topics.items()}
             fields |= {f"{key}.{name}": v for name, v in r.fields.items()}
@@ -162,10 +163,6 @@ def _episodes(value: Any, source: str, depth: int = 0) -> Iterator[Recording]:
             r.ledger.merge(ledger)
             name = "-".join(filter(None, [key if len(inner) > 1 else "", r.name]))
             yield dataclasses.replace(r, name=name, fields={**fields, **r.fields})
-
-
-def _rows(recording: Recording) -> int:
-    return max(topic.rows for topic in recording.topics.values())
 
 
 def _listed(value: Any) -> Any:
