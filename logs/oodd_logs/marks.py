@@ -201,13 +201,11 @@ def rows_of(
     """
     rows = []
     for mark in marks:
-        if not len(positions) or mark.stop - tolerance <= positions[0]:
-            continue
         start = int(np.searchsorted(positions, mark.start - tolerance))
         stop = max(int(np.searchsorted(positions, mark.stop - tolerance)), start + 1)
-        if start < len(positions):
-            marked_start = -1 if math.isinf(mark.start) else start
-            rows.append((marked_start, min(stop, len(positions)), mark.kind))
+        if start < len(positions) and mark.stop - tolerance > positions[0]:
+            first = -1 if math.isinf(mark.start) else start
+            rows.append((first, min(stop, len(positions)), mark.kind))
     return sorted(rows)
 
 
