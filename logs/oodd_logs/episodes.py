@@ -12,7 +12,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Self, cast
+from typing import Any, Final, NamedTuple, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -259,57 +259,25 @@ def read_episodes(recipe: Recipe, root: Path) -> EpisodeSource:
     TrajectoryError
         When a recording cannot be read; the message names file and row.
     """
-    reading = _Reading(recipe, IntervalList.of(recipe, root), root=root)
-    return _read(reading, _recordings(reading, _listed(reading, root)))
+    reading = _Reading(recipe, root)
+    return reading.episodes(reading.recordings_of(reading.listed()))
 
 
 def make_episodes(
-    recipe: Recipe, recordings: Iterable[Recorded], intervals: IntervalList
+    recipe: Recipe, recordings: Iterable[Recorded], *, every: bool = False
 ) -> EpisodeSource:
-    """Make episodes of recordings, see `read_episodes`.
+    """Make episodes of recordings.
 
     Parameters
     ----------
     recipe
-        The recipe.
+        How rows become episodes.
     recordings
         What was recorded, in that order.
-    intervals
-        Anomalous rows by file.
+    every
+        Whether all are read, as by `read_every_episode`; else parts are made.
     """
-    return _read(_Reading(recipe, intervals), recordings)
-
-
-def _read(reading: "_Reading", recordings: Iterable[Recorded]) -> EpisodeSource:
-    try:
-        for recorded in recordings:
-            if any(topic.rows for topic in recorded.recording.topics.values()):
-                with _scan_goes_on(reading, recorded.label):
-                    _add(reading, recorded)
-            else:
-                item: Item = "file" if recorded.label == recorded.relative else "recording"
-                reading.ledger.add(item, "dropped", "no rows", source=recorded.label)
-        return _in_parts(reading)
-    except BaseException:
-        if reading.first:
-            reading.first.spool.close()
-        raise
-
-
-@contextlib.contextmanager
-def _scan_goes_on(reading: "_Reading", label: str, item: Item = "recording") -> Iterator[None]:
-    """Leave out what cannot be read, where every other episode is to be read."""
-    episodes = reading.parts.setdefault(EVERY, []) if reading.every else []
-    count = len(episodes)
-    try:
-        yield
-    except (TrajectoryError, UsageError) as error:
-        if not reading.every:
-            raise
-        del episodes[count:]
-        reading.failures.append(error)
-        reason = str(error).replace(f"{reading.root}/", "")
-        reading.ledger.add(item, "dropped", reason.removeprefix(label).lstrip(",: "), source=label)
+    return _Reading(recipe, every=every).episodes(recordings)
 
 
 def read_every_episode(recipe: Recipe, root: Path, files: Sequence[Path]) -> EpisodeSource:
@@ -341,32 +309,11 @@ def read_every_episode(recipe: Recipe, root: Path, files: Sequence[Path]) -> Epi
     """
     listed: dict[Path, set[str]] = {}
     for name, table in recipe.anomalous.items():
-        for pattern in table.files:
-            for path in names_matching(pattern, root):
-                listed.setdefault(root / path, set()).add(f"test/{name}")
-    reading = _for_scan(recipe, root)
-    roles = ((path, frozenset(listed.get(path, {FILES}))) for path in files)
-    return _read(reading, _recordings(reading, roles))
-
-
-def make_every_episode(recipe: Recipe, recordings: Iterable[Recorded]) -> EpisodeSource:
-    """Make episodes of recordings as `read_every_episode` does.
-
-    Parameters
-    ----------
-    recipe
-        How rows become episodes.
-    recordings
-        What was recorded, in that order.
-    """
-    return _read(_for_scan(recipe, Path()), recordings)
-
-
-def _for_scan(recipe: Recipe, root: Path) -> "_Reading":
-    stamped = recipe.time or recipe.rate is not None
-    gap = recipe.gap or (0.0 if stamped else None)
-    recipe = dataclasses.replace(recipe, missing="keep", gap=gap, paired=False)
-    return _Reading(recipe, IntervalList.of(recipe, root), every=True, root=root)
+        for path in (path for glob_ in table.files for path in names_matching(glob_, root)):
+            listed.setdefault(root / path, set()).add(f"test/{name}")
+    reading = _Reading(recipe, root, every=True)
+    roles = ((path, listed.get(path, {FILES})) for path in files)
+    return reading.episodes(reading.recordings_of(roles))
 
 
 def matching_files(patterns: Sequence[str], root: Path) -> list[Path]:
@@ -387,47 +334,6 @@ def matching_files(patterns: Sequence[str], root: Path) -> list[Path]:
         )
     files = dict.fromkeys(root / name for name in names)
     return sorted(files, key=lambda path: natural_order(path.as_posix()))
-
-
-def _listed(reading: "_Reading", root: Path) -> Iterator[tuple[Path, frozenset[str]]]:
-    """Yield the files of a recipe in natural order with their roles."""
-    recipe = reading.recipe
-    tables = {
-        FILES: recipe.nominal.files,
-        TRAIN: recipe.nominal.train,
-        CALIBRATION: recipe.nominal.calibration,
-        TWINS: (*recipe.nominal.test, *recipe.nominal.twins),
-    }
-    anomalous = {f"test/{name}": table.files for name, table in recipe.anomalous.items()}
-    absent = [pattern for pattern in recipe.globs if not names_matching(pattern, root)]
-    # Who has a part of a set lacks files of some anomalies; where all lack, that is an error.
-    there = {role: patterns for role, patterns in anomalous.items() if {*patterns} - {*absent}}
-    roles: dict[Path, set[str]] = {}
-    for role, patterns in (tables | (there or anomalous)).items():
-        for path in matching_files(patterns, root):
-            roles.setdefault(path, set()).add(role)
-    for pattern in absent:
-        reading.ledger.add("file", "dropped", "no file matches", name=pattern)
-    for path in sorted(roles, key=lambda path: natural_order(path.as_posix())):
-        nominal_roles = roles[path] & NOMINAL_ROLES
-        if len(nominal_roles) > 1:
-            raise UsageError(f"{path} is in two nominal parts: {', '.join(sorted(nominal_roles))}")
-        yield path, frozenset(roles[path])
-
-
-def _recordings(
-    reading: "_Reading", files: Iterable[tuple[Path, frozenset[str]]]
-) -> Iterator[Recorded]:
-    """Yield the recordings of files with their roles."""
-    recipe, root = reading.recipe, reading.root
-    for path, roles in files:
-        relative = path.relative_to(root).as_posix() if path.is_relative_to(root) else str(path)
-        if path.is_file() and not path.stat().st_size:
-            reading.ledger.add("file", "dropped", "no rows", source=relative)
-            continue
-        with _scan_goes_on(reading, relative, "file"):
-            for recording in recordings_in(path, recipe, lenient=reading.every):
-                yield Recorded(recording, path, relative, roles)
 
 
 def names_matching(pattern: str, root: Path) -> list[str]:
@@ -456,8 +362,7 @@ def files_of(recipe: Recipe, root: Path) -> Iterator[Path]:
         yield root / recipe.intervals
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _First:
+class _First(NamedTuple):
     """Columns of the first recording, which all others share, and where rows are kept."""
 
     layout: Layout
@@ -473,14 +378,13 @@ class _Reading:
     """State of reading recordings one after another, into parts or all into `EVERY`."""
 
     recipe: Recipe
-    intervals: IntervalList
-    every: bool = False
     root: Path = Path()
+    every: bool = False
     ledger: Ledger = field(default_factory=Ledger)
     first: _First | None = None
     respellings: dict[Layout, Mapping[tuple[str, str], str]] = field(default_factory=dict)
     selections: dict[Layout, Selection] = field(default_factory=dict)
-    labels: dict[Layout, list[str]] = field(default_factory=dict)  # of recordings
+    recordings: int = 0
     parts: dict[str, list[EpisodeFacts]] = field(default_factory=dict)
     spans: list[tuple[float, float]] = field(default_factory=list)  # first and last stamps
     steps: dict[int, dict[str, Steps]] = field(default_factory=dict)  # by topic and recording
@@ -490,11 +394,14 @@ class _Reading:
     cut_by_outcome: set[str] = field(default_factory=set)  # parts with windows without a label
     label_counts: LabelCounts = field(default_factory=lambda: defaultdict(Counter))
     unlabelled: set[str] = field(default_factory=set)  # label columns that recordings lack
+    intervals: IntervalList = field(init=False)
 
-    @property
-    def recordings(self) -> int:
-        """Number of the recordings that were read."""
-        return sum(map(len, self.labels.values()))
+    def __post_init__(self) -> None:
+        if self.every:
+            stamped = self.recipe.time or self.recipe.rate is not None
+            gap = self.recipe.gap or (0.0 if stamped else None)
+            self.recipe = dataclasses.replace(self.recipe, missing="keep", gap=gap, paired=False)
+        self.intervals = IntervalList.of(self.recipe, self.root)
 
     @property
     def shortest(self) -> int:
@@ -507,105 +414,461 @@ class _Reading:
         pairs = itertools.pairwise(sorted(self.spans))
         return len(self.spans) == self.recordings and all(a[1] < b[0] for a, b in pairs)
 
+    def listed(self) -> Iterator[tuple[Path, set[str]]]:
+        """Yield the files of the recipe in natural order with their roles."""
+        nominal, root = self.recipe.nominal, self.root
+        tables = {FILES: nominal.files, TRAIN: nominal.train, CALIBRATION: nominal.calibration}
+        tables[TWINS] = (*nominal.test, *nominal.twins)
+        anomalous = {f"test/{name}": table.files for name, table in self.recipe.anomalous.items()}
+        absent = [pattern for pattern in self.recipe.globs if not names_matching(pattern, root)]
+        # Who has a part of a set lacks files of some anomalies; where all lack, that is an error.
+        there = {role: patterns for role, patterns in anomalous.items() if {*patterns} - {*absent}}
+        roles: dict[Path, set[str]] = {}
+        for role, patterns in (tables | (there or anomalous)).items():
+            for path in matching_files(patterns, root):
+                roles.setdefault(path, set()).add(role)
+        for pattern in absent:
+            self.ledger.add("file", "dropped", "no file matches", name=pattern)
+        for path in sorted(roles, key=lambda path: natural_order(path.as_posix())):
+            parts = ", ".join(sorted(roles[path] & NOMINAL_ROLES))
+            if "," in parts:
+                raise UsageError(f"{path} is in two nominal parts: {parts}")
+            yield path, roles[path]
 
-def _add(reading: _Reading, recorded: Recorded) -> None:
-    """Read one recording and keep its episodes."""
-    recipe, ledger = reading.recipe, Ledger()
-    recorded = _respelled(reading, recorded, ledger).meeting(recipe)
-    recording, label = recorded.recording, recorded.label
-    if not recorded.roles:
-        reading.ledger.add("recording", "dropped", "meets no condition (where)", source=label)
-        return
-    selection, first = _selected(reading, recording)
-    outcome, kind, task = _outcome_kind_and_task(recorded, recipe, lenient=reading.every)
-    stamped = StampedRows(recorded, selection, recipe, ledger)
-    marks = stamped.marks(reading.intervals, is_anomalous=bool(kind or recorded.kinds))
-    stretches, times = stamped.stretches()
-    number = reading.recordings
-    numbers = itertools.count()
-    for stretch in stretches:
-        above = first.spool.rows
-        spool_stretch(first.spool, stretch, stamped.topics, first.converter, recording.source)
-        rows = rows_of(marks, stretch.positions, stretch.tolerance)
-        is_cut = len(stretches) > 1
-        for part, start, stop, intervals, is_piece in _cut(
-            reading, recorded, kind, stretch.rows, rows, is_cut=is_cut
-        ):
-            piece = next(numbers)
-            facts = EpisodeFacts(
-                part,
-                f"{recording.name}#{piece}" if is_piece else recording.name,
-                recording.source,
-                above + start,
-                stop - start,
-                () if part in NOMINAL_ROLES else merged(intervals),
-                outcome,
-                task,
-                *stretch.begin_and_step(start, stop),
-                recording.fields,
-                number,
-            )
-            _keep(reading, facts, label)
-    for text, counts in stamped.labels.items():
-        reading.label_counts[text].update(counts)
-    reading.unlabelled |= {*recipe.label_columns} - {*stamped.labels}
-    for text in recipe.label_columns:
-        if text not in selection.labels and (text in recipe.labels or recorded.kinds):
-            ledger.add("recording", "kept", f"has no column {text!r}: rows count as nominal")
-    ledger.merge(recording.ledger)
-    reading.ledger.merge(ledger, label)
-    reading.names |= {recorded.relative, recording.name}
-    reading.labels.setdefault(layout_of(recording), []).append(label)
-    if times:
-        reading.spans.append((min(t[0] for t in times), max(t[-1] for t in times)))
+    def recordings_of(self, files: Iterable[tuple[Path, set[str]]]) -> Iterator[Recorded]:
+        """Yield the recordings of files with their roles."""
+        for path, roles in files:
+            is_below = path.is_relative_to(self.root)
+            relative = path.relative_to(self.root).as_posix() if is_below else str(path)
+            if path.is_file() and not path.stat().st_size:
+                self.ledger.add("file", "dropped", "no rows", source=relative)
+                continue
+            with self._scan_goes_on(relative, "file"):
+                for recording in recordings_in(path, self.recipe, lenient=self.every):
+                    yield Recorded(recording, path, relative, frozenset(roles))
+
+    def episodes(self, recordings: Iterable[Recorded]) -> EpisodeSource:
+        """Read recordings and return all episodes."""
+        try:
+            for recorded in recordings:
+                label = recorded.label
+                if any(topic.rows for topic in recorded.recording.topics.values()):
+                    with self._scan_goes_on(label, "recording"):
+                        self._add(recorded)
+                else:
+                    item: Item = "file" if label == recorded.relative else "recording"
+                    self.ledger.add(item, "dropped", "no rows", source=label)
+            return self._every_episode() if self.every else self._in_parts()
+        except BaseException:
+            if self.first:
+                self.first.spool.close()
+            raise
+
+    @contextlib.contextmanager
+    def _scan_goes_on(self, label: str, item: Item) -> Iterator[None]:
+        """Leave out what cannot be read, where every other episode is to be read."""
+        episodes = self.parts.setdefault(EVERY, []) if self.every else []
+        count = len(episodes)
+        try:
+            yield
+        except (TrajectoryError, UsageError) as error:
+            if not self.every:
+                raise
+            del episodes[count:]
+            self.failures.append(error)
+            reason = str(error).replace(f"{self.root}/", "").removeprefix(label).lstrip(",: ")
+            self.ledger.add(item, "dropped", reason, source=label)
+
+    def _add(self, recorded: Recorded) -> None:
+        """Read one recording and keep its episodes."""
+        recipe, ledger = self.recipe, Ledger()
+        recorded = self._respelled(recorded, ledger).meeting(recipe)
+        recording, label = recorded.recording, recorded.label
+        if not recorded.roles:
+            self.ledger.add("recording", "dropped", "meets no condition (where)", source=label)
+            return
+        selection, first = self._selected(recording)
+        outcome, kind, task = self._outcome_kind_and_task(recorded)
+        stamped = StampedRows(recorded, selection, recipe, ledger)
+        marks = stamped.marks(self.intervals, is_anomalous=bool(kind or recorded.kinds))
+        stretches, times = stamped.stretches()
+        is_cut, numbers = len(stretches) > 1, itertools.count()
+        for stretch in stretches:
+            above = first.spool.rows
+            spool_stretch(first.spool, stretch, stamped.topics, first.converter, recording.source)
+            rows = rows_of(marks, stretch.positions, stretch.tolerance)
+            for part, start, stop, inside, is_piece in self._cut(
+                recorded, kind, stretch.rows, rows, is_cut=is_cut
+            ):
+                piece = next(numbers)
+                facts = EpisodeFacts(
+                    part,
+                    f"{recording.name}#{piece}" if is_piece else recording.name,
+                    recording.source,
+                    above + start,
+                    stop - start,
+                    () if part in NOMINAL_ROLES else merged(inside),
+                    outcome,
+                    task,
+                    *stretch.begin_and_step(start, stop),
+                    recording.fields,
+                    self.recordings,
+                )
+                self._keep(facts, label)
+        for text, counts in stamped.labels.items():
+            self.label_counts[text].update(counts)
+        self.unlabelled |= {*recipe.label_columns} - {*stamped.labels}
+        for text in recipe.label_columns:
+            if text not in selection.labels and (text in recipe.labels or recorded.kinds):
+                ledger.add("recording", "kept", f"has no column {text!r}: rows count as nominal")
+        for name in selection.unused:
+            ledger.add("column", "dropped", "no line names it", name=name)
+        ledger.merge(recording.ledger)
+        self.ledger.merge(ledger, label)
+        self.names |= {recorded.relative, recording.name}
+        self.recordings += 1
+        if times:
+            self.spans.append((min(t[0] for t in times), max(t[-1] for t in times)))
         for i, steps in enumerate(map(Steps.of, times)):
             if steps.usual:
-                reading.steps.setdefault(i, {})[label] = steps
+                self.steps.setdefault(i, {})[label] = steps
 
+    def _respelled(self, recorded: Recorded, ledger: Ledger) -> Recorded:
+        """Return a recording whose columns have the names of the recipe, or of the first one."""
+        layout = layout_of(recorded.recording)
+        if layout not in self.respellings:
+            first = self.first.layout if self.first else None
+            self.respellings[layout] = respellings(layout, self.recipe, first)
+        names = self.respellings[layout]
+        for (_, old), new in names.items():
+            is_form = unicodedata.normalize("NFC", old) == unicodedata.normalize("NFC", new)
+            spelled = ascii(old) if is_form else repr(old)
+            ledger.add("column", "changed", f"taken from {spelled}, as the file lacks it", name=new)
+        return dataclasses.replace(recorded, recording=respelled(recorded.recording, names))
 
-def _respelled(reading: _Reading, recorded: Recorded, ledger: Ledger) -> Recorded:
-    """Return a recording whose columns have the names of the recipe, or of the first recording."""
-    layout = layout_of(recorded.recording)
-    if layout not in reading.respellings:
-        first = reading.first.layout if reading.first else None
-        reading.respellings[layout] = respellings(layout, reading.recipe, first)
-    names = reading.respellings[layout]
-    for (_, old), new in names.items():
-        is_form = unicodedata.normalize("NFC", old) == unicodedata.normalize("NFC", new)
-        spelled = ascii(old) if is_form else repr(old)
-        ledger.add("column", "changed", f"taken from {spelled}, as the file lacks it", name=new)
-    return dataclasses.replace(recorded, recording=respelled(recorded.recording, names))
+    def _selected(self, recording: Recording) -> tuple[Selection, _First]:
+        """Return the columns of a recording, and those of the first, in whose order they are."""
+        layout, recipe, source = layout_of(recording), self.recipe, recording.source
+        discrete, start = (recording.fields.get(name, 0) for name in ("discrete", "start"))
+        is_discrete = str(discrete) != "0"
+        choices = f"{discrete!s:.40} choices from {start!s:.40} on" if is_discrete else "numbers"
+        if layout not in self.selections:
+            try:
+                selection = select_columns(layout, recipe, source)
+            except UnknownNameError as error:
+                if self.first is None:
+                    raise
+                raise TrajectoryError(f"{error}; {self.first.source} has it") from None
+            except UsageError as error:
+                raise UsageError(f"{source}: {str(error).removeprefix(source)}") from None
+            if self.first is None:
+                if discrete and not recipe.discrete:
+                    names = tuple(map(str, recording.fields.get("choices", ())))
+                    recipe = dataclasses.replace(recipe, discrete=names or int(discrete))
+                converter = Converter(selection, recipe, int(start) if discrete else 0)
+                spool = Spool(converter.width)
+                self.first = _First(layout, selection, converter, spool, source, choices)
+            self.selections[layout] = _in_order(selection, self.first, source)
+        first = cast("_First", self.first)
+        if choices != first.choices:
+            expected = f"expected {first.choices} as in {first.source}"
+            raise TrajectoryError(f"{source}: its actions are {choices}, {expected}")
+        return self.selections[layout], first
 
+    def _outcome_kind_and_task(self, recorded: Recorded) -> tuple[bool | None, str, str]:
+        """Return outcome, anomaly and task of a recording by its fields, None or empty without."""
+        recipe = self.recipe
 
-def _selected(reading: _Reading, recording: Recording) -> tuple[Selection, _First]:
-    """Return the columns of a recording, and those of the first, in whose order they are."""
-    layout, recipe, source = layout_of(recording), reading.recipe, recording.source
-    discrete, start = (recording.fields.get(name, 0) for name in ("discrete", "start"))
-    is_discrete = str(discrete) != "0"
-    choices = f"{discrete!s:.40} choices from {start!s:.40} on" if is_discrete else "numbers"
-    if layout not in reading.selections:
-        try:
-            selection = select_columns(layout, recipe, source)
-        except UnknownNameError as error:
-            if reading.first is None:
-                raise
-            raise TrajectoryError(f"{error}; {reading.first.source} has it") from None
-        except UsageError as error:
-            raise UsageError(f"{source}: {str(error).removeprefix(source)}") from None
-        if reading.first is None:
-            if discrete and not recipe.discrete:
-                names = tuple(map(str, recording.fields.get("choices", ())))
-                recipe = dataclasses.replace(recipe, discrete=names or int(discrete))
-            converter = Converter(selection, recipe, int(start) if discrete else 0)
-            spool = Spool(converter.width)
-            reading.first = _First(layout, selection, converter, spool, source, choices)
-        reading.selections[layout] = _in_order(selection, reading.first, source)
-    first = cast("_First", reading.first)
-    if choices != first.choices:
-        raise TrajectoryError(
-            f"{source}: its actions are {choices}, expected {first.choices} as in {first.source}"
+        def value(name: str, *, last: bool = False) -> str | None:
+            with contextlib.suppress(*[UnknownNameError] * self.every):
+                return recorded.text(name, last=last) if name else None
+            return None
+
+        said = value(recipe.outcome, last=True)
+        outcome = None if said is None else said.lower() in _TRUE
+        if said and said.lower() not in _TRUE | _FALSE:
+            problem = f"{recipe.outcome} is {said.lower()!r}, expected true or false"
+            raise TrajectoryError(f"{recorded.source}: {problem}")
+        kind = ""
+        if (text := value(recipe.kinds)) is not None:
+            nominal = map(text_of, recipe.nominal.where.get(recipe.kinds, ()))
+            kind = "" if text in nominal else anomaly_name(text)
+        elif outcome is False:
+            fallback = [name for name, table in recipe.anomalous.items() if not table.files]
+            kind = next(iter([*recorded.kinds, *fallback]), FAILURE)
+        return outcome, kind, value(recipe.task) or ""
+
+    def _cut(
+        self,
+        recorded: Recorded,
+        kind: str,
+        total: int,
+        rows: Sequence[AnomalousRows],
+        *,
+        is_cut: bool,
+    ) -> Iterator[tuple[str, int, int, Sequence[AnomalousRows], bool]]:
+        """Yield part, rows and anomalous rows of the episodes of a stretch, and if it was cut."""
+        windows: dict[int, set[str]] = {}
+        for role in sorted(recorded.roles):
+            table = self.recipe.anomalous.get(role.removeprefix("test/"), _NO_FILES)
+            is_nominal = self.every or role in NOMINAL_ROLES
+            window = self.recipe.nominal.window if is_nominal else table.window
+            windows.setdefault(self.recipe.window if window is None else window, set()).add(role)
+        for window, roles in windows.items():
+            has_windows = 0 < window < total
+            is_piece = has_windows or is_cut
+            length = window if has_windows else total
+            for start in range(0, total, length):
+                stop = min(start + length, total)
+                inside = [
+                    (max(a - start, 0 if a >= 0 or start else -1), min(b, stop) - start, name)
+                    for a, b, name in rows
+                    if b > start and a < stop
+                ]
+                parts = self._parts_of(recorded, roles, kind, inside, is_piece=is_piece)
+                # A short last window is kept where it is labelled, and where all are judged.
+                is_plain = NOMINAL_ROLES & {*parts} or (parts and not inside)
+                if stop - start < length and is_plain and not self.every:
+                    reason, count = "at ends of recordings, less than a window", stop - start
+                    self.ledger.add("row", "dropped", reason, count=count, source=recorded.label)
+                elif stop - start < self.shortest:
+                    if not (is_piece or self.every):
+                        raise self._too_short(recorded.recording, stop - start)
+                    reason = f"pieces shorter than {self.shortest} rows"
+                    self.ledger.add("episode", "dropped", reason, source=recorded.label)
+                else:
+                    if has_windows and not inside:
+                        self.cut_by_outcome |= {*parts} - NOMINAL_ROLES
+                    yield from ((part, start, stop, inside, is_piece) for part in parts)
+
+    def _parts_of(
+        self,
+        recorded: Recorded,
+        roles: set[str],
+        kind: str,
+        inside: Sequence[AnomalousRows],
+        *,
+        is_piece: bool,
+    ) -> list[str]:
+        """Return the parts that an episode of a recording belongs to."""
+        source, recipe = recorded.source, self.recipe
+        if kind:
+            return [f"test/{kind}"]
+        nominal = sorted(roles & NOMINAL_ROLES)
+        kinds = sorted(role.removeprefix("test/") for role in roles - NOMINAL_ROLES)
+        unsaid = [] if any(map(self._says_rows, kinds)) else [f"test/{name}" for name in kinds]
+        if self.every:
+            named = [name for *_, name in inside if name]
+            said = [f"test/{(named or kinds or [_ANOMALOUS])[0]}"]
+            return said if inside else unsaid[:1] or [EVERY]
+        if recipe.kinds or recipe.outcome:
+            if not nominal:
+                reason = "nominal, in files of an anomaly alone"
+                self.ledger.add("recording", "dropped", reason, source=recorded.label)
+            return nominal
+        if not inside and (nominal or recipe.paired or unsaid):
+            return nominal or [f"test/{name}" for name in kinds]
+        labelled = {name for *_, name in inside}
+        # Intervals may name an anomaly that has no files of its own.
+        fileless = {n for n in labelled if n and not recipe.anomalous.get(n, _NO_FILES).files}
+        if matching := [n for n in sorted({*kinds} | fileless) if labelled & {"", n}]:
+            return [f"test/{name}" for name in matching]
+        # Problems are raised at the end: names in a list of intervals, or labels, may be wrong.
+        if is_piece or (inside and not nominal):
+            reason = "windows of anomalous recordings without an anomalous row"
+            reason = "windows with anomalous rows, of nominal files" if inside else reason
+            self.ledger.add("episode", "dropped", reason, source=recorded.label)
+        elif inside:
+            start, stop, _ = inside[0]
+            self.problems.append(
+                f"{source} is listed as nominal, but is anomalous in rows {max(start, 0)} to "
+                f"{stop - 1}: list it under [anomalous.NAME], or cut it with window, so that the "
+                "windows without anomalous rows are nominal; labels of nominal rows other than 0, "
+                "false, H or nothing are named by nominal_label"
+            )
+        else:
+            labels = {*recipe.labels, *(t for k in kinds for t in recipe.anomalous[k].labels)}
+            columns = f" in {' and '.join(map(repr, sorted(labels)))}" if labels else ""
+            self.problems.append(
+                f"{source} has no anomalous row by its labels{columns}, expected some as it is "
+                f"listed under {', '.join(kinds)}: leave it out, or list it under [nominal]"
+            )
+        return []
+
+    def _says_rows(self, kind: str) -> bool:
+        """Tell whether the recipe says which rows of an anomaly are anomalous."""
+        recipe, table = self.recipe, self.recipe.anomalous.get(kind, _NO_FILES)
+        has_onset = {recipe.onset, table.onset} != {None}
+        return bool(recipe.labels or table.labels or self.intervals or has_onset)
+
+    def _too_short(self, recording: Recording, rows: int) -> TrajectoryError:
+        least, rate = self.shortest, self.recipe.rate
+        why = ", more than the baseline" if least > 2 else ""
+        logged = max(topic.rows for topic in recording.topics.values())
+        if rate and logged >= least:
+            why += (
+                f"; {logged} rows were logged: are rate = {rate:g} and the unit of the stamps "
+                "right, as in time = 'NAME[ms]'?"
+            )
+        problem = f"{counted(rows, 'observation(s)')}, expected at least {least}{why}"
+        return TrajectoryError(f"{recording.source} has {problem}")
+
+    def _keep(self, facts: EpisodeFacts, label: str) -> None:
+        baseline, part = self.recipe.baseline, EVERY if self.every else facts.part
+        early = [start for start, _ in facts.intervals if 0 <= start < baseline]
+        if early and "#" not in facts.name and not self.every:
+            self.problems.append(
+                f"{facts.source} is anomalous from row {early[0]} on, expected its first "
+                f"{baseline} rows (baseline) to be nominal"
+            )
+        elif early and not self.every:
+            reason = "windows that are anomalous within their baseline"
+            self.ledger.add("episode", "dropped", reason, source=label)
+        else:
+            episodes = self.parts.setdefault(part, [])
+            if len(episodes) == EPISODES and not self.every:
+                raise UsageError(f"{part} has more than {EPISODES} episodes, the most there are")
+            episodes.append(facts)
+
+    def _every_episode(self) -> EpisodeSource:
+        """Return all episodes in one part, in the order of stamps if these tell it."""
+        for error in self.intervals.unused(self.names):
+            self.ledger.add("mark", "dropped", str(error))
+        if self.by_stamps:
+            self.parts.get(EVERY, []).sort(key=lambda facts: facts.begin)
+        source = self._source(self.parts)
+        for text, problem in label_problems(self.label_counts, self.unlabelled, self.recipe):
+            self.ledger.add("column", "kept", problem, name=text)
+        return source
+
+    def _in_parts(self) -> EpisodeSource:
+        """Return all episodes in their parts."""
+        recipe, selections = self.recipe, self.selections
+        if self.first is None:
+            raise UsageError("there are no recordings to read, expected at least one")
+        for error in self.intervals.unused(self.names):
+            raise error
+        labelled = {text for selection in selections.values() for text in selection.labels}
+        for text in (text for text in recipe.label_columns if text not in labelled):
+            columns = {name for layout in selections for name in named_columns(layout)}
+            raise UnknownNameError("column with labels", text, columns)
+        for _, problem in label_problems(self.label_counts, self.unlabelled, self.recipe):
+            raise UsageError(problem)
+        for problem in self.problems:
+            raise TrajectoryError(problem)
+        parts = self._shared_out()
+        for part in (part for part in (TRAIN, CALIBRATION) if not parts[part]):
+            why = f"[nominal] names no file with one for {part}"
+            if left_out := [f"{counted(e.count, f'{e.item}(s)')}, {e.reason}" for e in self.ledger]:
+                why = f"left out are {'; '.join(left_out)}"
+            if count := len(self.parts.get(FILES, ())):
+                why = f"the nominal files make {count}; a window cuts long recordings into several"
+            raise UsageError(f"there are no {part} episodes, expected at least 1: {why}")
+        present = [part.removeprefix("test/") for part in self.parts if part not in NOMINAL_ROLES]
+        kinds = in_order(present, ANOMALIES)
+        listed = [name for name, table in recipe.anomalous.items() if table.files]
+        lacking = [name for name in listed if name not in kinds]
+        if lacking and not kinds:
+            raise UsageError(f"[anomalous.{lacking[0]}] has no episodes, expected at least one")
+        parts |= {f"test/{kind}": self.parts[f"test/{kind}"] for kind in kinds}
+        source = self._source(parts)
+        groups = {kind: recipe.anomalous.get(kind, _NO_FILES).group for kind in kinds}
+        source.groups = groups | {k: ANOMALIES[k].group for k in kinds if k in ANOMALIES}
+        _settle_columns(source, recipe)
+        source.notes[:0] = self._notes(source)
+        if lacking:
+            source.notes.append(f"no episodes of these anomalies: {', '.join(lacking)}")
+        return source
+
+    def _source(self, parts: dict[str, list[EpisodeFacts]]) -> EpisodeSource:
+        if self.first is None or not any(parts.values()):
+            for failure in self.failures:
+                raise failure
+            raise UsageError("there are no episodes to read, expected at least one")
+        for steps in self.steps.values():
+            median = float(np.median([s.usual for s in steps.values()]))
+            for label, step in ((label, s.usual) for label, s in steps.items()):
+                if not median / SLOWER < step < median * SLOWER:
+                    reason = f"a row every {step:g} s, where others have one every {median:g} s"
+                    self.ledger.add("recording", "kept", reason, source=label)
+        converter = self.first.converter
+        source = EpisodeSource(
+            converter.sensors,
+            converter.actions,
+            converter.discrete,
+            self.first.selection.reward is not None,
+            self.first.spool,
+            tuple(range(converter.width)),
+            self.recipe.rate or even_rate(self._all_steps()),
+            parts,
+            ledger=self.ledger,
+            recordings=self.recordings + len(self.failures),
         )
-    return reading.selections[layout], first
+        _say_far(source)
+        return source
+
+    def _all_steps(self) -> list[Steps]:
+        return [steps for of_topic in self.steps.values() for steps in of_topic.values()]
+
+    def _shared_out(self) -> dict[str, list[EpisodeFacts]]:
+        """Return nominal episodes by part: shares of each task, in the order of the recording."""
+        recipe = self.recipe
+        parts: dict[str, list[EpisodeFacts]] = {p: self.parts.get(p, []) for p in _SHARED}
+        episodes = list(self.parts.get(FILES, []))
+        if self.by_stamps:
+            episodes.sort(key=lambda facts: facts.begin)
+        if recipe.order == "shuffled":
+            order = np.random.default_rng(recipe.seed).permutation(len(episodes))
+            episodes = [episodes[i] for i in order]
+        for task in dict.fromkeys(facts.task for facts in episodes):
+            of_task = [facts for facts in episodes if facts.task == task]
+            shares = np.cumsum(recipe.nominal.parts)
+            bounds = [0, *np.rint(shares * len(of_task)).astype(int).tolist(), len(of_task)]
+            for part, start, stop in zip(_SHARED, bounds, bounds[1:], strict=False):
+                parts[part] = parts[part] + of_task[start:stop]
+        return parts
+
+    def _notes(self, source: EpisodeSource) -> list[str]:
+        recipe = self.recipe
+        sensors = counted(len(source.sensors), "sensor(s)")
+        actions = counted(len(source.actions), "action(s)")
+        lines = [f"read {counted(self.recordings, 'recording(s)')}: {sensors}, {actions}"]
+        for part, episodes in source.parts.items():
+            rows = sum(facts.rows for facts in episodes)
+            line = f"{part}: {counted(len(episodes), 'episode(s)')}, {counted(rows, 'row(s)')}"
+            intervals = [interval for facts in episodes for interval in facts.intervals]
+            if part not in _SHARED and intervals:
+                anomalous = sum(stop - max(start, 0) for start, stop in intervals)
+                line += f", {counted(len(intervals), 'interval(s)')} with "
+                line += counted(anomalous, "anomalous row(s)")
+            elif part not in _SHARED:
+                line += ", known by their outcome alone"
+            if episodes or part != TWINS:
+                lines.append(line)
+            if part in self.cut_by_outcome:
+                lines.append(
+                    f"warning: {part} was cut by window, and nothing says which rows are "
+                    "anomalous: every window counts as anomalous, also those before the fault. "
+                    "Name the anomalous rows (labels, intervals, or onset, which is 0 where the "
+                    "fault is there from the first row on), or leave out window"
+                )
+        if recipe.nominal.files:
+            how = "in the order of their stamps" if self.by_stamps else "in the order of files"
+            how = f"shuffled (seed {recipe.seed})" if recipe.order == "shuffled" else how
+            lines.append(f"nominal episodes were shared out {how}")
+        if self.steps and source.rate is None:
+            steps = self._all_steps()
+            shortest, longest = min(s.shortest for s in steps), max(s.longest for s in steps)
+            lines.append(
+                f"rows are {shortest:g} to {longest:g} s apart and taken as they are: rate in the "
+                "recipe resamples them"
+            )
+        if self.first and (choices := self.first.converter.choices):
+            lines.append(
+                f"actions are whole numbers from 0 to {choices - 1}: if they are choices, "
+                f"discrete = {choices} (--discrete {choices}) makes each a column"
+            )
+        return lines
 
 
 def _in_order(selection: Selection, first: _First, source: str) -> Selection:
@@ -633,343 +896,6 @@ def _in_order(selection: Selection, first: _First, source: str) -> Selection:
     return dataclasses.replace(
         selection, sensors=ordered["sensors"], actions=ordered["actions"], unused=unused
     )
-
-
-def _outcome_kind_and_task(
-    recorded: Recorded, recipe: Recipe, *, lenient: bool
-) -> tuple[bool | None, str, str]:
-    """Return outcome, anomaly and task of a recording by its fields, None or empty without."""
-
-    def value(name: str, *, last: bool = False) -> str | None:
-        try:
-            return recorded.text(name, last=last) if name else None
-        except UnknownNameError:
-            if lenient:
-                return None
-            raise
-
-    text = value(recipe.outcome, last=True)
-    outcome = None if text is None else text.lower() in _TRUE
-    if text is not None and text.lower() not in _TRUE | _FALSE:
-        raise TrajectoryError(
-            f"{recorded.source}: {recipe.outcome} is {text.lower()!r}, expected true or false"
-        )
-    kind = ""
-    if (text := value(recipe.kinds)) is not None:
-        nominal = map(text_of, recipe.nominal.where.get(recipe.kinds, ()))
-        kind = "" if text in nominal else anomaly_name(text)
-    elif outcome is False:
-        fallback = [name for name, table in recipe.anomalous.items() if not table.files]
-        kind = next(iter([*recorded.kinds, *fallback]), FAILURE)
-    return outcome, kind, value(recipe.task) or ""
-
-
-def _cut(
-    reading: _Reading,
-    recorded: Recorded,
-    kind: str,
-    total: int,
-    rows: Sequence[AnomalousRows],
-    *,
-    is_cut: bool,
-) -> Iterator[tuple[str, int, int, Sequence[AnomalousRows], bool]]:
-    """Yield part, rows and anomalous rows of the episodes of a stretch, and if it was cut."""
-    for window, roles in _windows(reading, recorded).items():
-        has_windows = 0 < window < total
-        is_piece = has_windows or is_cut
-        length = window if has_windows else total
-        for start in range(0, total, length):
-            stop = min(start + length, total)
-            inside = [
-                (a - start if a > start else 0 if a >= 0 or start else -1, min(b, stop) - start, n)
-                for a, b, n in rows
-                if b > start and a < stop
-            ]
-            parts = _parts_of(reading, recorded, roles, kind, inside, is_piece=is_piece)
-            # A short last window is kept where it is labelled, and where all are to be judged.
-            takes_short = reading.every or not (NOMINAL_ROLES & {*parts} or (parts and not inside))
-            source = recorded.label
-            if stop - start < length and not takes_short:
-                reason, count = "at ends of recordings, less than a window", stop - start
-                reading.ledger.add("row", "dropped", reason, count=count, source=source)
-            elif stop - start < reading.shortest:
-                if not (is_piece or reading.every):
-                    raise _too_short(reading, recorded.recording, stop - start)
-                reason = f"pieces shorter than {reading.shortest} rows"
-                reading.ledger.add("episode", "dropped", reason, source=source)
-            else:
-                if has_windows and not inside:
-                    reading.cut_by_outcome |= {*parts} - NOMINAL_ROLES
-                yield from ((part, start, stop, inside, is_piece) for part in parts)
-
-
-def _windows(reading: _Reading, recorded: Recorded) -> dict[int, set[str]]:
-    """Return the roles of a recording by the length of their windows."""
-    windows: dict[int, set[str]] = {}
-    recipe = reading.recipe
-    for role in sorted(recorded.roles):
-        is_nominal = reading.every or role in NOMINAL_ROLES
-        table = recipe.nominal if is_nominal else recipe.anomalous[role.removeprefix("test/")]
-        length = recipe.window if table.window is None else table.window
-        windows.setdefault(length, set()).add(role)
-    return windows
-
-
-def _parts_of(
-    reading: _Reading,
-    recorded: Recorded,
-    roles: set[str],
-    kind: str,
-    inside: Sequence[AnomalousRows],
-    *,
-    is_piece: bool,
-) -> list[str]:
-    """Return the parts that an episode of a recording belongs to."""
-    source, recipe = recorded.source, reading.recipe
-
-    def leave_out(item: Item, reason: str) -> None:
-        reading.ledger.add(item, "dropped", reason, source=recorded.label)
-
-    if kind:
-        return [f"test/{kind}"]
-    nominal = sorted(roles & NOMINAL_ROLES)
-    kinds = {role.removeprefix("test/") for role in roles - NOMINAL_ROLES}
-    labelled = {name for *_, name in inside}
-    if reading.every:
-        if inside:
-            named = [name for *_, name in inside if name]
-            return [f"test/{(named or sorted(kinds) or [_ANOMALOUS])[0]}"]
-        is_said = any(_says_rows(reading, name) for name in kinds)
-        return [f"test/{name}" for name in sorted(kinds) if not is_said][:1] or [EVERY]
-    if recipe.kinds or recipe.outcome:
-        if not nominal:
-            leave_out("recording", "nominal, in files of an anomaly alone")
-        return nominal
-    # Intervals may name an anomaly that has no files of its own.
-    kinds |= {n for n in labelled if n and not recipe.anomalous.get(n, _NO_FILES).files}
-    if not inside:
-        if nominal:
-            return nominal
-        if recipe.paired or not any(_says_rows(reading, name) for name in kinds):
-            return [f"test/{name}" for name in sorted(kinds)]
-        if is_piece:
-            leave_out("episode", "windows of anomalous recordings without an anomalous row")
-            return []
-        # Raised at the end, as the names in a list of intervals may be wrong.
-        reading.problems.append(
-            f"{source} has no anomalous row by its labels, expected some as it is listed under "
-            f"{', '.join(sorted(kinds))}: leave it out, or list it under [nominal]"
-        )
-        return []
-    matching = [f"test/{name}" for name in sorted(kinds) if labelled & {"", name}]
-    if not matching and nominal and not is_piece:
-        start, stop, _ = inside[0]
-        # Raised at the end, as labels may say otherwise than the recipe takes it.
-        reading.problems.append(
-            f"{source} is listed as nominal, but is anomalous in rows {max(start, 0)} to "
-            f"{stop - 1}: list it under [anomalous.NAME], or cut it with window, so that the "
-            "windows without anomalous rows are nominal; labels of nominal rows other than 0, "
-            "false, H or nothing are named by nominal_label"
-        )
-        return []
-    if not matching:
-        leave_out("episode", "windows with anomalous rows, of nominal files")
-    return matching
-
-
-def _says_rows(reading: _Reading, kind: str) -> bool:
-    """Tell whether the recipe says which rows of an anomaly are anomalous."""
-    recipe, table = reading.recipe, reading.recipe.anomalous.get(kind, _NO_FILES)
-    onset = recipe.onset if table.onset is None else table.onset
-    return bool(recipe.labels or table.labels or reading.intervals or onset is not None)
-
-
-def _too_short(reading: _Reading, recording: Recording, rows: int) -> TrajectoryError:
-    least, rate = reading.shortest, reading.recipe.rate
-    why = ", more than the baseline" if least > 2 else ""
-    logged = max(topic.rows for topic in recording.topics.values())
-    if rate and logged >= least:
-        why += (
-            f"; {logged} rows were logged: are rate = {rate:g} and the unit of the stamps right, "
-            "as in time = 'NAME[ms]'?"
-        )
-    return TrajectoryError(
-        f"{recording.source} has {counted(rows, 'observation(s)')}, expected at least {least}{why}"
-    )
-
-
-def _keep(reading: _Reading, facts: EpisodeFacts, label: str) -> None:
-    baseline = 0 if reading.every else reading.recipe.baseline
-    if early := [start for start, _ in facts.intervals if 0 <= start < baseline]:
-        if "#" not in facts.name:
-            reading.problems.append(
-                f"{facts.source} is anomalous from row {early[0]} on, expected its first "
-                f"{baseline} rows (baseline) to be nominal"
-            )
-            return
-        reason = "windows that are anomalous within their baseline"
-        reading.ledger.add("episode", "dropped", reason, source=label)
-        return
-    episodes = reading.parts.setdefault(EVERY if reading.every else facts.part, [])
-    if len(episodes) == EPISODES and not reading.every:
-        raise UsageError(f"{facts.part} has more than {EPISODES} episodes, the most there are")
-    episodes.append(facts)
-
-
-def _in_parts(reading: _Reading) -> EpisodeSource:
-    """Return all episodes, in their parts, or in one in the order of stamps if these tell it."""
-    recipe, selections = reading.recipe, reading.selections
-    if reading.every:
-        for error in reading.intervals.unused(reading.names):
-            reading.ledger.add("mark", "dropped", str(error))
-        source = _source(reading, reading.parts)
-        if reading.by_stamps:
-            source.parts[EVERY].sort(key=lambda facts: facts.begin)
-        _say_far(source)
-        for text, problem in label_problems(reading.label_counts, reading.unlabelled, recipe):
-            reading.ledger.add("column", "kept", problem, name=text)
-        return source
-    if reading.first is None:
-        raise UsageError("there are no recordings to read, expected at least one")
-    for error in reading.intervals.unused(reading.names):
-        raise error
-    labelled = {text for selection in selections.values() for text in selection.labels}
-    for text in (text for text in recipe.label_columns if text not in labelled):
-        columns = {name for layout in selections for name in named_columns(layout)}
-        raise UnknownNameError("column with labels", text, columns)
-    for _, problem in label_problems(reading.label_counts, reading.unlabelled, recipe):
-        raise UsageError(problem)
-    for problem in reading.problems:
-        raise TrajectoryError(problem)
-    parts = _shared_out(reading)
-    for part in (part for part in (TRAIN, CALIBRATION) if not parts[part]):
-        why = f"[nominal] names no file with one for {part}"
-        if left_out := [f"{counted(e.count, f'{e.item}(s)')}, {e.reason}" for e in reading.ledger]:
-            why = f"left out are {'; '.join(left_out)}"
-        if count := len(reading.parts.get(FILES, ())):
-            why = f"the nominal files make {count}; a window cuts long recordings into several"
-        raise UsageError(f"there are no {part} episodes, expected at least 1: {why}")
-    kinds = in_order(
-        (part.removeprefix("test/") for part in reading.parts if part not in NOMINAL_ROLES),
-        ANOMALIES,
-    )
-    listed = [name for name, table in recipe.anomalous.items() if table.files]
-    lacking = [name for name in listed if name not in kinds]
-    if lacking and not kinds:
-        raise UsageError(f"[anomalous.{lacking[0]}] has no episodes, expected at least one")
-    parts |= {f"test/{kind}": reading.parts[f"test/{kind}"] for kind in kinds}
-    source = _source(reading, parts)
-    groups = {kind: recipe.anomalous.get(kind, _NO_FILES).group for kind in kinds}
-    source.groups = groups | {kind: ANOMALIES[kind].group for kind in kinds if kind in ANOMALIES}
-    _say_far(source)
-    _settle_columns(source, recipe)
-    source.notes[:0] = _notes(reading, source)
-    if lacking:
-        source.notes.append(f"no episodes of these anomalies: {', '.join(lacking)}")
-    return source
-
-
-def _source(reading: _Reading, parts: dict[str, list[EpisodeFacts]]) -> EpisodeSource:
-    if reading.first is None or not any(parts.values()):
-        for failure in reading.failures:
-            raise failure
-        raise UsageError("there are no episodes to read, expected at least one")
-    converter, rate = reading.first.converter, reading.recipe.rate
-    if rate is None and reading.steps:
-        rate = even_rate([s for of_topic in reading.steps.values() for s in of_topic.values()])
-    _say_of_all(reading)
-    return EpisodeSource(
-        converter.sensors,
-        converter.actions,
-        converter.discrete,
-        reading.first.selection.reward is not None,
-        reading.first.spool,
-        tuple(range(converter.width)),
-        rate,
-        parts,
-        ledger=reading.ledger,
-        recordings=reading.recordings + len(reading.failures),
-    )
-
-
-def _say_of_all(reading: _Reading) -> None:
-    """Add what is known when all recordings are read: unused columns, and clocks of other units."""
-    unused: dict[str, list[str]] = {}
-    for layout, labels in reading.labels.items():
-        for name in reading.selections[layout].unused:
-            unused.setdefault(name, []).extend(labels)
-    for name, labels in unused.items():
-        for label in labels:
-            reading.ledger.add("column", "dropped", "no line names it", name=name, source=label)
-    for steps in reading.steps.values():
-        median = float(np.median([s.usual for s in steps.values()]))
-        for label, step in ((label, s.usual) for label, s in steps.items()):
-            if not median / SLOWER < step < median * SLOWER:
-                reason = f"a row every {step:g} s, where others have one every {median:g} s"
-                reading.ledger.add("recording", "kept", reason, source=label)
-
-
-def _shared_out(reading: _Reading) -> dict[str, list[EpisodeFacts]]:
-    """Return nominal episodes by part: shares of each task, in the order of the recording."""
-    recipe = reading.recipe
-    parts: dict[str, list[EpisodeFacts]] = {p: reading.parts.get(p, []) for p in _SHARED}
-    episodes = list(reading.parts.get(FILES, []))
-    if reading.by_stamps:
-        episodes.sort(key=lambda facts: facts.begin)
-    if recipe.order == "shuffled":
-        order = np.random.default_rng(recipe.seed).permutation(len(episodes))
-        episodes = [episodes[i] for i in order]
-    for task in dict.fromkeys(facts.task for facts in episodes):
-        of_task = [facts for facts in episodes if facts.task == task]
-        shares = np.cumsum(recipe.nominal.parts)
-        bounds = [0, *np.rint(shares * len(of_task)).astype(int).tolist(), len(of_task)]
-        for part, start, stop in zip(_SHARED, bounds, bounds[1:], strict=False):
-            parts[part] = parts[part] + of_task[start:stop]
-    return parts
-
-
-def _notes(reading: _Reading, source: EpisodeSource) -> list[str]:
-    recipe = reading.recipe
-    sensors = counted(len(source.sensors), "sensor(s)")
-    actions = counted(len(source.actions), "action(s)")
-    lines = [f"read {counted(reading.recordings, 'recording(s)')}: {sensors}, {actions}"]
-    for part, episodes in source.parts.items():
-        rows = sum(facts.rows for facts in episodes)
-        line = f"{part}: {counted(len(episodes), 'episode(s)')}, {counted(rows, 'row(s)')}"
-        intervals = [interval for facts in episodes for interval in facts.intervals]
-        if part not in _SHARED and intervals:
-            anomalous = sum(stop - max(start, 0) for start, stop in intervals)
-            line += f", {counted(len(intervals), 'interval(s)')} with "
-            line += counted(anomalous, "anomalous row(s)")
-        elif part not in _SHARED:
-            line += ", known by their outcome alone"
-        if episodes or part != TWINS:
-            lines.append(line)
-        if part in reading.cut_by_outcome:
-            lines.append(
-                f"warning: {part} was cut by window, and nothing says which rows are "
-                "anomalous: every window counts as anomalous, also those before the fault. "
-                "Name the anomalous rows (labels, intervals, or onset, which is 0 where the "
-                "fault is there from the first row on), or leave out window"
-            )
-    if recipe.nominal.files:
-        how = "in the order of their stamps" if reading.by_stamps else "in the order of files"
-        if recipe.order == "shuffled":
-            how = f"shuffled (seed {recipe.seed})"
-        lines.append(f"nominal episodes were shared out {how}")
-    if reading.steps and source.rate is None:
-        steps = [s for of_topic in reading.steps.values() for s in of_topic.values()]
-        shortest, longest = min(s.shortest for s in steps), max(s.longest for s in steps)
-        lines.append(
-            f"rows are {shortest:g} to {longest:g} s apart and taken as they are: rate in the "
-            "recipe resamples them"
-        )
-    if reading.first and (choices := reading.first.converter.choices):
-        lines.append(
-            f"actions are whole numbers from 0 to {choices - 1}: if they are choices, "
-            f"discrete = {choices} (--discrete {choices}) makes each a column"
-        )
-    return lines
 
 
 def _say_far(source: EpisodeSource) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from oodd_eval.arrays import as_array, as_numbers, in_memory, is_missing
 from oodd_eval.errors import TrajectoryError
-from oodd_logs.episodes import EpisodeSource, make_every_episode
+from oodd_logs.episodes import EpisodeSource, make_episodes
 from oodd_logs.readers import library
 from oodd_logs.recipe import Recipe
 from oodd_logs.recorded import FILES, Recorded
@@ -76,7 +76,7 @@ def scanned_frames(episodes: Sequence[Any], sensors: Sequence[Any]) -> EpisodeSo
     recipe = Recipe("frames", "frames", sensors=names)
     if not names:
         recipe = replace(recipe, sensors=unnamed_columns(layout_of(recorded[0].recording), recipe))
-    return make_every_episode(recipe, recorded)
+    return make_episodes(recipe, recorded, every=True)
 
 
 def _each(episodes: Iterable[Any]) -> Iterator[Any]:

@@ -41,7 +41,7 @@ from oodd_logs.episodes import (
     read_episodes,
 )
 from oodd_logs.ledger import Ledger
-from oodd_logs.marks import IntervalList, read_intervals
+from oodd_logs.marks import read_intervals
 from oodd_logs.readers import readers
 from oodd_logs.recipe import AnomalousFiles, Interval, NominalFiles, Recipe
 from oodd_logs.recorded import Recorded
@@ -369,7 +369,7 @@ def import_frames(
         layout_ = layout_of(recorded[0].recording)
         recipe = dataclasses.replace(recipe, sensors=unnamed_columns(layout_, recipe))
     target = _Target.of(recipe, output, replace=replace)
-    with make_episodes(recipe, recorded, IntervalList.of(recipe, Path())) as source:
+    with make_episodes(recipe, recorded) as source:
         return target.write(source, _quiet, report)
 
 

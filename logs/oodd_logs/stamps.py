@@ -250,7 +250,7 @@ def on_grid(
 
 def even_rate(recordings: Sequence[Steps]) -> float | None:
     """Return rows in a second where shortest and longest steps are nearly the usual one."""
-    usual = float(np.median([steps.usual for steps in recordings]))
+    usual = float(np.median([steps.usual for steps in recordings] or [np.nan]))
     extremes = [x for steps in recordings for x in (steps.shortest, steps.longest)]
-    even = all(abs(step - usual) <= _UNEVEN * usual for step in extremes)
+    even = extremes and all(abs(step - usual) <= _UNEVEN * usual for step in extremes)
     return 1.0 / usual if even else None

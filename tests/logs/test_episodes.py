@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from helpers_logs import write_table as write
 from oodd_logs.episodes import make_episodes, read_episodes
-from oodd_logs.marks import IntervalList, anomalous_cells, merged
+from oodd_logs.marks import anomalous_cells, merged
 from oodd_logs.recipe import Recipe
 from oodd_logs.recorded import Recorded
 from oodd_logs.recording import Recording, Topic
@@ -162,7 +162,7 @@ def in_memory(topics, fields=None, name="run", **keys):
         Recorded(recording, tmp, str(tmp), frozenset({part}))
         for part, tmp in (("train", Path("x")), ("calibration", Path("y")))
     ]
-    with make_episodes(made, recorded, IntervalList(made.intervals, "intervals")) as source:
+    with make_episodes(made, recorded) as source:
         return source, list(source.episodes("train"))
 
 
