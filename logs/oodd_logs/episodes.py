@@ -38,7 +38,7 @@ from oodd_logs.readers import in_order as natural_order
 from oodd_logs.recipe import FAILURE, AnomalousFiles, Recipe, anomaly_name
 from oodd_logs.recorded import FILES, NOMINAL_ROLES, SLOWER, Recorded, StampedRows, text_of
 from oodd_logs.recording import Recording
-from oodd_logs.rows import Converter, Spool, spool_stretch
+from oodd_logs.rows import Converter, Spool
 from oodd_logs.selecting import (
     ChosenColumn,
     Layout,
@@ -59,6 +59,7 @@ _ANOMALOUS: Final = "anomalous"  # where labels name no anomaly
 _SAMPLED: Final = 1 << 17  # values that tell usual deviations
 _BLOCK: Final = 1 << 16  # rows that are read at once
 _NO_FILES: Final = AnomalousFiles()
+_NO_ROWS: Final = np.empty((0, 0)), np.empty((0, 0))
 _SHARED: Final = (TRAIN, CALIBRATION, TWINS)
 _TRUE: Final = {"1", "1.0", "true", "yes", "success", "ok"}
 _FALSE: Final = {"0", "0.0", "false", "no", "failure", ""}
@@ -110,20 +111,18 @@ class Episode:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EpisodeFacts:
-    """Facts of an episode whose rows are on disk; see `Episode`."""
+    """Facts of an episode whose rows are on disk, from the first on.
+
+    The episode is without them; the time of the first and seconds between them are NaN without
+    stamps.
+    """
 
     part: str
-    name: str
-    source: str
+    episode: Episode
     first: int
     rows: int
-    intervals: tuple[tuple[int, int], ...]
-    outcome: bool | None
-    task: str
     begin: float
     step: float
-    fields: Mapping[str, Any]
-    recording: int
 
 
 @dataclass(slots=True, eq=False)
@@ -221,19 +220,12 @@ class EpisodeSource:
         for facts in self.parts[part]:
             rows = self.rows(facts, 0, facts.rows)
             time = facts.begin + facts.step * np.arange(facts.rows, dtype=np.float64)
-            yield Episode(
-                facts.name,
-                facts.source,
-                rows[:, :width],
-                rows[:-1, width:-1],
-                rows[:-1, -1] if self.rewards else None,
-                facts.intervals,
-                facts.outcome,
-                facts.task,
-                "" if facts.part in {EVERY, *NOMINAL_ROLES} else facts.part.removeprefix("test/"),
-                time if np.isfinite(facts.begin) else None,
-                facts.fields,
-                facts.recording,
+            yield dataclasses.replace(
+                facts.episode,
+                observations=rows[:, :width],
+                actions=rows[:-1, width:-1],
+                rewards=rows[:-1, -1] if self.rewards else None,
+                time=time if np.isfinite(facts.begin) else None,
             )
 
 
@@ -367,7 +359,6 @@ class _First(NamedTuple):
 
     layout: Layout
     selection: Selection
-    converter: Converter
     spool: Spool
     source: str
     choices: str
@@ -495,25 +486,20 @@ class _Reading:
         is_cut, numbers = len(stretches) > 1, itertools.count()
         for stretch in stretches:
             above = first.spool.rows
-            spool_stretch(first.spool, stretch, stamped.topics, first.converter, recording.source)
+            first.spool.add(stretch, stamped.topics, recording.source)
             rows = rows_of(marks, stretch.positions, stretch.tolerance)
             for part, start, stop, inside, is_piece in self._cut(
                 recorded, kind, stretch.rows, rows, is_cut=is_cut
             ):
                 piece = next(numbers)
-                facts = EpisodeFacts(
-                    part,
-                    f"{recording.name}#{piece}" if is_piece else recording.name,
-                    recording.source,
-                    above + start,
-                    stop - start,
-                    () if part in NOMINAL_ROLES else merged(inside),
-                    outcome,
-                    task,
-                    *stretch.begin_and_step(start, stop),
-                    recording.fields,
-                    self.recordings,
-                )
+                name = f"{recording.name}#{piece}" if is_piece else recording.name
+                is_nominal = part in NOMINAL_ROLES
+                intervals = () if is_nominal else merged(inside)
+                anomaly = "" if is_nominal or part == EVERY else part.removeprefix("test/")
+                about: Any = outcome, task, anomaly, None, recording.fields, self.recordings
+                episode = Episode(name, recording.source, *_NO_ROWS, None, intervals, *about)
+                begin, step = stretch.begin_and_step(start, stop)
+                facts = EpisodeFacts(part, episode, above + start, stop - start, begin, step)
                 self._keep(facts, label)
         for text, counts in stamped.labels.items():
             self.label_counts[text].update(counts)
@@ -566,8 +552,7 @@ class _Reading:
                     names = tuple(map(str, recording.fields.get("choices", ())))
                     recipe = dataclasses.replace(recipe, discrete=names or int(discrete))
                 converter = Converter(selection, recipe, int(start) if discrete else 0)
-                spool = Spool(converter.width)
-                self.first = _First(layout, selection, converter, spool, source, choices)
+                self.first = _First(layout, selection, Spool(converter), source, choices)
             self.selections[layout] = _in_order(selection, self.first, source)
         first = cast("_First", self.first)
         if choices != first.choices:
@@ -715,10 +700,10 @@ class _Reading:
 
     def _keep(self, facts: EpisodeFacts, label: str) -> None:
         baseline, part = self.recipe.baseline, EVERY if self.every else facts.part
-        early = [start for start, _ in facts.intervals if 0 <= start < baseline]
-        if early and "#" not in facts.name and not self.every:
+        early = [start for start, _ in facts.episode.intervals if 0 <= start < baseline]
+        if early and "#" not in facts.episode.name and not self.every:
             self.problems.append(
-                f"{facts.source} is anomalous from row {early[0]} on, expected its first "
+                f"{facts.episode.source} is anomalous from row {early[0]} on, expected its first "
                 f"{baseline} rows (baseline) to be nominal"
             )
         elif early and not self.every:
@@ -791,7 +776,7 @@ class _Reading:
                 if not median / SLOWER < step < median * SLOWER:
                     reason = f"a row every {step:g} s, where others have one every {median:g} s"
                     self.ledger.add("recording", "kept", reason, source=label)
-        converter = self.first.converter
+        converter = self.first.spool.converter
         source = EpisodeSource(
             converter.sensors,
             converter.actions,
@@ -820,8 +805,8 @@ class _Reading:
         if recipe.order == "shuffled":
             order = np.random.default_rng(recipe.seed).permutation(len(episodes))
             episodes = [episodes[i] for i in order]
-        for task in dict.fromkeys(facts.task for facts in episodes):
-            of_task = [facts for facts in episodes if facts.task == task]
+        for task in dict.fromkeys(facts.episode.task for facts in episodes):
+            of_task = [facts for facts in episodes if facts.episode.task == task]
             shares = np.cumsum(recipe.nominal.parts)
             bounds = [0, *np.rint(shares * len(of_task)).astype(int).tolist(), len(of_task)]
             for part, start, stop in zip(_SHARED, bounds, bounds[1:], strict=False):
@@ -836,7 +821,7 @@ class _Reading:
         for part, episodes in source.parts.items():
             rows = sum(facts.rows for facts in episodes)
             line = f"{part}: {counted(len(episodes), 'episode(s)')}, {counted(rows, 'row(s)')}"
-            intervals = [interval for facts in episodes for interval in facts.intervals]
+            intervals = [interval for facts in episodes for interval in facts.episode.intervals]
             if part not in _SHARED and intervals:
                 anomalous = sum(stop - max(start, 0) for start, stop in intervals)
                 line += f", {counted(len(intervals), 'interval(s)')} with "
@@ -863,7 +848,7 @@ class _Reading:
                 f"rows are {shortest:g} to {longest:g} s apart and taken as they are: rate in the "
                 "recipe resamples them"
             )
-        if self.first and (choices := self.first.converter.choices):
+        if self.first and (choices := self.first.spool.converter.choices):
             lines.append(
                 f"actions are whole numbers from 0 to {choices - 1}: if they are choices, "
                 f"discrete = {choices} (--discrete {choices}) makes each a column"
@@ -917,9 +902,9 @@ def _say_far(source: EpisodeSource) -> None:
         for facts in every if largest[d] + abs(centre) > most else []:
             column = source.rows(facts, 0, facts.rows)[:, d]
             for row in np.flatnonzero(np.abs(column - centre) > most).tolist():
-                entry: dict[str, Any] = {"source": facts.name, "cell": f"{column[row]:g}"}
-                reason, name = "no measurement by its size", sensor.name
-                source.ledger.add("cell", "kept", reason, name=name, row=row, **entry)
+                entry: dict[str, Any] = {"source": facts.episode.name, "cell": f"{column[row]:g}"}
+                reason = "no measurement by its size"
+                source.ledger.add("cell", "kept", reason, name=sensor.name, row=row, **entry)
 
 
 def _settle_columns(source: EpisodeSource, recipe: Recipe) -> None:
@@ -927,16 +912,17 @@ def _settle_columns(source: EpisodeSource, recipe: Recipe) -> None:
     train = _moments(source, source.parts[TRAIN])
     is_constant = train.low == train.high
     names = ", ".join(q.name for q, same in zip(source.sensors, is_constant, strict=True) if same)
-    if names and recipe.constant == "drop":
-        kept, width = np.flatnonzero(~is_constant), len(source.sensors)
-        if not len(kept):
+    is_dropped = recipe.constant == "drop"
+    if names:
+        how = "left out as constant" if is_dropped else "constant"
+        source.notes.append(f"{how} in training: {names}")
+    if names and is_dropped:
+        kept, width = np.flatnonzero(~is_constant).tolist(), len(source.sensors)
+        if not kept:
             raise UsageError(f"all sensors are constant in training: {names}")
-        source.notes.append(f"left out as constant in training: {names}")
         source.sensors = tuple(source.sensors[i] for i in kept)
-        source._kept = (*kept.tolist(), *range(width, len(source._kept)))  # noqa: SLF001
+        source._kept = (*kept, *range(width, len(source._kept)))  # noqa: SLF001
         train = _moments(source, source.parts[TRAIN])
-    elif names:
-        source.notes.append(f"constant in training: {names}")
     every = _moments(source, [facts for episodes in source.parts.values() for facts in episodes])
     # What training never shows may still move later.
     spread = np.where(train.low == train.high, every.high - every.low, train.spread)
@@ -949,13 +935,10 @@ def _settle_columns(source: EpisodeSource, recipe: Recipe) -> None:
     blurred = is_coarse(spread, every.largest)
     if blurred.any():
         source.offsets = tuple(np.where(blurred, train.mean, 0.0).tolist())
-        texts = [
-            f"{source.sensors[i].name} ({train.mean[i]:g}, spread {spread[i]:.2g})"
-            for i in np.flatnonzero(blurred)
-        ]
-        source.notes.append(
-            f"the training mean is subtracted, as float32 could not tell values: {', '.join(texts)}"
-        )
+        columns = zip(source.sensors, train.mean, spread, blurred, strict=True)
+        texts = [f"{q.name} ({mean:g}, spread {s:.2g})" for q, mean, s, is_so in columns if is_so]
+        reason = "the training mean is subtracted, as float32 could not tell values"
+        source.notes.append(f"{reason}: {', '.join(texts)}")
 
 
 def _moments(source: EpisodeSource, episodes: Iterable[EpisodeFacts]) -> RunningMoments:

@@ -9,6 +9,7 @@ import dataclasses
 import itertools
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, cast
 
@@ -108,12 +109,14 @@ def import_recipe(
         When a recording is not as it must be; the message names file and row.
     """
     recipe.check()
-    target = _Target.of(recipe, output, replace=replace)
+    directory = output or data_home() / recipe.split
+    _entries(recipe, directory, replace=replace)
     for name in (layout.MANIFEST, f"{recipe.environment}.h5"):
-        refuse_inputs(target.directory / name, files_of(recipe, root), "the split's file")
+        refuse_inputs(directory / name, files_of(recipe, root), "the split's file")
     with read_episodes(recipe, root) as source:
         (Ledger() if ledger is None else ledger).merge(source.ledger)
-        return target.write(source, progress, report)
+        say = {"progress": progress, "report": report}
+        return _write(recipe, directory, source, replace=replace, **say)
 
 
 def import_data(
@@ -174,31 +177,30 @@ def import_data(
     check_known("format", readers(), form)
     tests = {} if test is None else _test_parts(form, test)
     files = {kind: _files_of(form, path) for kind, path in tests.items()}
-    kinds = [kind for kind in tests if kind != "nominal"]
+    kinds = in_order((kind for kind in tests if kind != "nominal"), ANOMALIES)
     if test is not None and "nominal" not in tests:
         raise UsageError(
             f"{str(test)!r} has {', '.join(tests) or 'nothing'}, expected a part 'nominal', too: "
             "each anomalous episode needs a nominal twin of the same name to be compared with; "
             "a recipe imports episodes without twins"
         )
-    check_known(f"anomaly in {test}", kinds, *(groups or {}))
-    check_known("group", GROUPS, *(groups or {}).values())
-    default_groups = {kind: ANOMALIES[kind].group for kind in kinds if kind in ANOMALIES}
-    group_of = default_groups | cast("dict[str, Group]", dict(groups or {}))
+    group_of = cast("dict[str, Group]", dict(groups or {}))
+    check_known(f"anomaly in {test}", kinds, *group_of)
+    check_known("group", GROUPS, *group_of.values())
+    group_of = {k: ANOMALIES[k].group for k in kinds if k in ANOMALIES} | group_of
     anomalous = {
-        kind: AnomalousFiles(files=files[kind], group=group_of.get(kind, "dynamics"))
-        for kind in in_order(kinds, ANOMALIES)
+        kind: AnomalousFiles(files[kind], group_of.get(kind, "dynamics")) for kind in kinds
     }
     train_files, calibration_files = (_files_of(form, part) for part in (train, calibration))
-    twins = files.get("nominal", ())
+    twins, intervals = files.get("nominal", ()), tuple(_onsets(tests[kind] for kind in kinds))
     nominal = NominalFiles(train=train_files, calibration=calibration_files, twins=twins)
-    onsets = tuple(_onsets(tests[kind] for kind in kinds))
-    keys: dict[str, Any] = {"discrete": discrete, "paired": True, "format": form}
-    keys |= {"intervals": onsets, "nominal": nominal, "anomalous": anomalous}
-    recipe = Recipe(name, environment, **keys)
+    recipe = Recipe(name, environment, discrete=discrete, paired=True, format=form)
+    keys: dict[str, Any] = {"nominal": nominal, "anomalous": anomalous, "intervals": intervals}
+    recipe = dataclasses.replace(recipe, **keys)
     recipe.check()
-    named = _with_names(recipe, sensors, actions)
-    return import_recipe(named, Path(), output, replace=replace, **say)
+    if sensors or actions:
+        recipe = _with_names(recipe, sensors, actions)
+    return import_recipe(recipe, Path(), output, replace=replace, **say)
 
 
 def _files_of(form: str, part: Path) -> tuple[str, ...]:
@@ -206,21 +208,17 @@ def _files_of(form: str, part: Path) -> tuple[str, ...]:
     reader = readers()[form]
     if not part.exists():
         raise UsageError(f"{str(part)!r} does not exist, expected {reader.part}, or a folder of it")
-    if not part.is_dir() or reader.fits(part):
-        return (_escaped(part),)
-    files = [p for p in part.iterdir() if p.is_file() and reader.fits(p) and _is_log(p)]
+    files = [part]
+    if part.is_dir() and not reader.fits(part):
+        files = [p for p in part.iterdir() if p.is_file() and reader.fits(p) and _is_log(p)]
     if not files:
         file_kind = " or ".join(f"*{suffix}" for suffix in reader.suffixes) or reader.part
         raise UsageError(f"{str(part)!r} has no files {file_kind}, expected one an episode")
-    return tuple(map(_escaped, files))
+    return tuple(re.sub(r"([*?\[])", r"[\1]", str(path)) for path in files)
 
 
 def _is_log(path: Path) -> bool:
     return path.name != ONSETS and not path.name.startswith(".")
-
-
-def _escaped(path: Path) -> str:
-    return re.sub(r"([*?\[])", r"[\1]", str(path))
 
 
 def _test_parts(form: str, folder: Path) -> dict[str, Path]:
@@ -255,32 +253,29 @@ def _onsets(parts: Iterable[Path]) -> Iterator[Interval]:
 
 def _with_names(recipe: Recipe, sensors: Sequence[Quantity], actions: Sequence[Quantity]) -> Recipe:
     """Return a recipe that gives the columns of the first episode some names."""
-    if not sensors and not actions:
-        return recipe
     path = matching_files(recipe.nominal.train, Path())[0]
     recording = next(recordings_in(path, recipe), None)
     if recording is None:
         raise UsageError(f"{path} has no episodes, expected at least one")
     selection = select_columns(layout_of(recording), recipe, recording.source)
-    names: dict[str, Any] = {}
-    for kind, quantities in (("sensors", sensors), ("actions", actions)):
+    keys: dict[str, Any] = {"reward": selection.reward.column if selection.reward else ""}
+    for kind, new in (("sensors", sensors), ("actions", actions)):
         columns = getattr(selection, kind)
-        named = [quantity.name for quantity in quantities]
+        names = tuple(quantity.name for quantity in new)
         choices = recipe.discrete or recording.fields.get("discrete", 0)
-        discrete = kind == "actions" and bool(named and choices)
-        count = int(cast("int", choices)) if discrete else len(columns)
-        if named and (len(named) != count or len({*named}) < len(named)):
+        is_discrete = kind == "actions" and bool(names and choices)
+        count = int(cast("int", choices)) if is_discrete else len(columns)
+        if names and (len(names) != count or len({*names}) < len(names)):
             raise UsageError(
-                f"there are {count} {kind}, named {', '.join(named)}: expected as many different "
+                f"there are {count} {kind}, named {', '.join(names)}: expected as many different "
                 f"names (--{kind})"
             )
-        if discrete:
-            names["discrete"] = tuple(named)
-        is_new = quantities and not discrete
-        pairs = zip(quantities if is_new else [c.quantity for c in columns], columns, strict=True)
-        names[kind] = tuple(f"{q.name}[{q.unit}]={c.column}" for q, c in pairs)
-    reward = selection.reward.column if selection.reward else ""
-    return dataclasses.replace(recipe, **names, reward=reward)
+        if is_discrete:
+            keys["discrete"] = names
+        quantities = new if names and not is_discrete else [c.quantity for c in columns]
+        pairs = zip(quantities, columns, strict=True)
+        keys[kind] = tuple(f"{q.name}[{q.unit}]={c.column}" for q, c in pairs)
+    return dataclasses.replace(recipe, **keys)
 
 
 def import_frames(
@@ -368,99 +363,88 @@ def import_frames(
     if not recipe.sensors and recorded:
         layout_ = layout_of(recorded[0].recording)
         recipe = dataclasses.replace(recipe, sensors=unnamed_columns(layout_, recipe))
-    target = _Target.of(recipe, output, replace=replace)
+    directory = output or data_home() / recipe.split
+    _entries(recipe, directory, replace=replace)
     with make_episodes(recipe, recorded) as source:
-        return target.write(source, _quiet, report)
+        return _write(recipe, directory, source, replace=replace, progress=_quiet, report=report)
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class _Target:
-    """Place of an environment: a new split, or one that was imported earlier."""
-
-    recipe: Recipe
-    directory: Path
-    entries: Mapping[str, Any]
-    replace: bool
-
-    @classmethod
-    def of(cls, recipe: Recipe, output: Path | None, *, replace: bool) -> "_Target":
-        """Return it; `UsageError` when names are taken, by what is not to be replaced."""
-        directory = output or data_home() / recipe.split
-        if not (directory / layout.MANIFEST).exists():
-            return cls(recipe, directory, {}, replace)
-        manifest = layout.read_manifest(directory)
-        name, environment = recipe.split, recipe.environment
-        if manifest["definition"] != {"name": name, "source": IMPORTED}:
-            raise UsageError(
-                f"{str(directory)!r} holds the split {manifest['name']!r}, which was not imported "
-                f"as {name!r}: choose another name"
-            )
-        if environment in manifest["environments"] and not replace:
-            raise UsageError(
-                f"split {name!r} has an environment {environment!r} already: choose another name, "
-                "or replace it (--replace, replace=True)"
-            )
-        return cls(recipe, directory, manifest["environments"], replace)
-
-    def write(self, source: EpisodeSource, progress: Say, report: Say) -> Split:
-        """Write the episodes as the environment, and the manifest."""
-        recipe, environment = self.recipe, self.recipe.environment
-        keys = ("paired", "clock", "baseline", "order", "source", "licence", "citation")
-        from_recipe = {key: getattr(recipe, key) for key in keys}
-        facts = LogFacts(rate=source.rate, offsets=source.offsets, **from_recipe)
-        environment_facts = layout.own_facts(
-            environment, discrete=source.discrete, groups=source.groups, sensors=source.sensors
+def _entries(recipe: Recipe, directory: Path, *, replace: bool) -> Mapping[str, Any]:
+    """Return the entries of a manifest; `UsageError` for a name of what is not to be replaced."""
+    if not (directory / layout.MANIFEST).exists():
+        return {}
+    manifest = layout.read_manifest(directory)
+    name, environment = recipe.split, recipe.environment
+    if manifest["definition"] != {"name": name, "source": IMPORTED}:
+        raise UsageError(
+            f"{str(directory)!r} holds the split {manifest['name']!r}, which was not imported "
+            f"as {name!r}: choose another name"
         )
-        with only_writer(self.directory):
-            # Another import may have added an environment meanwhile.
-            entries = self.of(recipe, self.directory, replace=self.replace).entries
-            entry = layout.write_environment(
-                self.directory / f"{environment}.h5",
-                _groups(source, progress, paired=recipe.paired),
-                IMPORTED,
-                sensors=source.sensors,
-                actions=source.actions,
-                custom=environment_facts,
-                # What earlier versions could import keeps its digest.
-                logs=None if facts == LogFacts() else facts,
-                recordings=_recordings(source),
-            )
-            # No part of the digest: it is of the episodes.
-            entries = {**entries, environment: entry | {"ledger": source.summary}}
-            ordered = {name: entries[name] for name in in_order(entries, ENVIRONMENTS)}
-            versions = {"oodd-eval": __version__, "numpy": np.__version__}
-            definition = {"name": recipe.split, "source": IMPORTED}
-            layout.write_manifest(self.directory, definition, ordered, 0, versions)
-        for line in (*source.notes, *source.summary):
-            report(line)
-        return Split(self.directory)
+    if environment in manifest["environments"] and not replace:
+        raise UsageError(
+            f"split {name!r} has an environment {environment!r} already: choose another name, "
+            "or replace it (--replace, replace=True)"
+        )
+    return cast("Mapping[str, Any]", manifest["environments"])
+
+
+def _write(
+    recipe: Recipe, directory: Path, source: EpisodeSource, *, replace: bool, **say: Say
+) -> Split:
+    """Write episodes as an environment, and the manifest."""
+    keys = ("paired", "clock", "baseline", "order", "source", "licence", "citation")
+    from_recipe = {key: getattr(recipe, key) for key in keys}
+    facts = LogFacts(rate=source.rate, offsets=source.offsets, **from_recipe)
+    environment_facts = layout.own_facts(
+        recipe.environment, discrete=source.discrete, groups=source.groups, sensors=source.sensors
+    )
+    with only_writer(directory):
+        # Another import may have added an environment meanwhile.
+        entries = _entries(recipe, directory, replace=replace)
+        entry = layout.write_environment(
+            directory / f"{recipe.environment}.h5",
+            _groups(source, say["progress"], paired=recipe.paired),
+            IMPORTED,
+            sensors=source.sensors,
+            actions=source.actions,
+            custom=environment_facts,
+            # What earlier versions could import keeps its digest.
+            logs=None if facts == LogFacts() else facts,
+            recordings=_recordings(source),
+        )
+        # No part of the digest: it is of the episodes.
+        entries = {**entries, recipe.environment: entry | {"ledger": source.summary}}
+        ordered = {name: entries[name] for name in in_order(entries, ENVIRONMENTS)}
+        versions = {"oodd-eval": __version__, "numpy": np.__version__}
+        definition = {"name": recipe.split, "source": IMPORTED}
+        layout.write_manifest(directory, definition, ordered, 0, versions)
+    for line in (*source.notes, *source.summary):
+        say["report"](line)
+    return Split(directory)
 
 
 def _groups(source: EpisodeSource, progress: Say, *, paired: bool) -> Iterator[tuple[str, _Arrays]]:
     """Yield the datasets of each part."""
     for part, episodes in source.parts.items():
         is_anomalous = part not in {TRAIN, CALIBRATION, TWINS}
-        if paired and is_anomalous:
-            yield part, _with_twins(source, part, episodes)
-        elif paired:
-            yield part, _rows(source, episodes)
-        else:
-            arrays = _rows(source, episodes) | {
-                "names": _texts([facts.name for facts in episodes]),
-                "tasks": _texts([facts.task for facts in episodes]),
-            }
-            if is_anomalous:
-                intervals = [interval for facts in episodes for interval in facts.intervals]
-                counts = [len(facts.intervals) for facts in episodes]
-                arrays["intervals"] = np.array(intervals, np.int64).reshape(-1, 2)
-                arrays["interval_offsets"] = np.cumsum([0, *counts])
-            yield part, arrays
+        twins = paired and is_anomalous
+        arrays = _with_twins(source, part, episodes) if twins else _rows(source, episodes)
+        if not paired:
+            arrays["names"] = _texts([facts.episode.name for facts in episodes])
+            arrays["tasks"] = _texts([facts.episode.task for facts in episodes])
+        if is_anomalous and not paired:
+            intervals = [interval for facts in episodes for interval in facts.episode.intervals]
+            arrays["intervals"] = np.array(intervals, np.int64).reshape(-1, 2)
+            counts = [len(facts.episode.intervals) for facts in episodes]
+            arrays["interval_offsets"] = np.cumsum([0, *counts])
+        yield part, arrays
         progress(part)
 
 
 def _recordings(source: EpisodeSource) -> dict[str, list[int]]:
     """Return the recording of each episode by part, empty where each episode is one."""
-    recordings = {part: [f.recording for f in facts] for part, facts in source.parts.items()}
+    parts = source.parts.items()
+    recordings = {part: [f.episode.recording or 0 for f in facts] for part, facts in parts}
     every = [*itertools.chain(*recordings.values())]
     return recordings if len({*every}) < len(every) else {}
 
@@ -475,20 +459,17 @@ def _rows(source: EpisodeSource, episodes: Sequence[EpisodeFacts]) -> _Arrays:
     width, total = len(source.sensors), sum(facts.rows for facts in episodes)
     steps = total - len(episodes)
 
-    def blocks(columns: slice | int, behind: int) -> Callable[[], Iterator[NDArray[np.float32]]]:
-        def read() -> Iterator[NDArray[np.float32]]:
-            for facts in episodes:
-                for rows in source.blocks(facts, behind=behind):
-                    yield rows[:, columns].astype(np.float32)
+    def read(columns: slice | int, behind: int) -> Iterator[NDArray[np.float32]]:
+        for facts in episodes:
+            for rows in source.blocks(facts, behind=behind):
+                yield rows[:, columns].astype(np.float32)
 
-        return read
-
-    seeds = [facts.fields.get("seed") for facts in episodes]
-    ended = [bool(facts.fields.get("terminated", False)) for facts in episodes]
+    seeds = [facts.episode.fields.get("seed") for facts in episodes]
+    ended = [bool(facts.episode.fields.get("terminated", False)) for facts in episodes]
     return {
-        "observations": Blocks((total, width), blocks(slice(width), 0)),
-        "actions": Blocks((steps, len(source.actions)), blocks(slice(width, -1), 1)),
-        "rewards": Blocks((steps,), blocks(-1, 1)),
+        "observations": Blocks((total, width), partial(read, slice(width), 0)),
+        "actions": Blocks((steps, len(source.actions)), partial(read, slice(width, -1), 1)),
+        "rewards": Blocks((steps,), partial(read, -1, 1)),
         "offsets": np.cumsum([0, *(facts.rows - 1 for facts in episodes)]),
         "seeds": np.array(range(len(seeds)) if None in seeds else seeds, np.int64),
         "terminated": np.array(ended, np.uint8),
@@ -508,9 +489,9 @@ def _with_twins(source: EpisodeSource, part: str, episodes: Sequence[EpisodeFact
         )
     ordered = [by_name[name] for name in twins]
     effects = [_effect(source, by_name[name], twin) for name, twin in twins.items()]
-    drawn = [dict(facts.fields.get("parameters", {})) for facts in ordered]
+    drawn = [dict(facts.episode.fields.get("parameters", {})) for facts in ordered]
     return _rows(source, ordered) | {
-        "onsets": np.array([facts.intervals[0][0] for facts in ordered], np.int64),
+        "onsets": np.array([facts.episode.intervals[0][0] for facts in ordered], np.int64),
         "effects": np.array(effects, np.int64),
         "redraws": np.zeros(len(ordered), np.int64),
         "parameters": layout.pack_parameters(drawn),
@@ -520,30 +501,29 @@ def _with_twins(source: EpisodeSource, part: str, episodes: Sequence[EpisodeFact
 def _by_name(part: str, episodes: Sequence[EpisodeFacts]) -> dict[str, EpisodeFacts]:
     by_name: dict[str, EpisodeFacts] = {}
     for facts in episodes:
-        if by_name.setdefault(facts.name, facts) is not facts:
-            name = repr(facts.name)
+        if by_name.setdefault(facts.episode.name, facts) is not facts:
+            name = repr(facts.episode.name)
             raise TrajectoryError(f"{part} has two episodes named {name}, expected one of each")
     return by_name
 
 
-def _effect(source: EpisodeSource, episode: EpisodeFacts, twin: EpisodeFacts) -> int:
+def _effect(source: EpisodeSource, facts: EpisodeFacts, twin: EpisodeFacts) -> int:
     """Return the first row from the onset on that differs from the twin's."""
-    common, width = min(episode.rows, twin.rows), len(source.sensors)
-    row = onset = episode.intervals[0][0] if episode.intervals else -1
+    common, width = min(facts.rows, twin.rows), len(source.sensors)
+    row = onset = facts.episode.intervals[0][0] if facts.episode.intervals else -1
+    name = facts.episode.source
     if onset < 0:
         raise TrajectoryError(
-            f"{episode.source} has no onset, the first row that may differ, expected 'onset' in "
-            "the file, a line of onsets.csv beside it, or labels, intervals or onset in a recipe"
+            f"{name} has no onset, the first row that may differ, expected 'onset' in the file, a "
+            "line of onsets.csv beside it, or labels, intervals or onset in a recipe"
         )
     if onset >= common:
-        raise TrajectoryError(
-            f"{episode.source}: the onset is row {onset}, expected 0 to {common - 1}, the last row "
-            "that the episode and its twin both have"
-        )
-    for blocks in zip(source.blocks(episode, onset), source.blocks(twin, onset), strict=False):
+        expected = f"0 to {common - 1}, the last row that the episode and its twin both have"
+        raise TrajectoryError(f"{name}: the onset is row {onset}, expected {expected}")
+    for blocks in zip(source.blocks(facts, onset), source.blocks(twin, onset), strict=False):
         rows, nominal = (block[: common - row, :width].astype(np.float32) for block in blocks)
         differs = (rows != nominal).any(axis=1)
         if differs.any():
             return row + int(differs.argmax())
         row += len(rows)
-    raise TrajectoryError(f"{episode.source} equals its twin from its onset, row {onset}, on")
+    raise TrajectoryError(f"{name} equals its twin from its onset, row {onset}, on")

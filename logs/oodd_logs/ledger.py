@@ -5,7 +5,7 @@ something out, holds it or changes it adds a line; what is kept as it is needs n
 """
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal, Self
 
@@ -157,11 +157,10 @@ class Ledger:
             Recording that all of them are about, in place of their sources.
         """
         for e in other:
-            row, cell = e.row, e.cell
+            about: Mapping[str, Any] = {"name": e.name, "row": e.row, "cell": e.cell}
             for name, count in e.sources.items():
                 where = name if source is None else source
-                values: Mapping[str, Any] = {"name": e.name, "count": count, "source": where}
-                self.add(e.item, e.fate, e.reason, row=row, cell=cell, **values)
+                self.add(e.item, e.fate, e.reason, count=count, source=where, **about)
 
     def __iter__(self) -> Any:
         return iter(self._entries.values())
@@ -226,14 +225,6 @@ class Ledger:
     def as_json(self) -> list[dict[str, Any]]:
         """Return the entries as values for JSON."""
         return [entry.as_json() for entry in self]
-
-    @classmethod
-    def joined(cls, ledgers: Iterable[Self]) -> Self:
-        """Return one ledger with the entries of several."""
-        ledger = cls()
-        for other in ledgers:
-            ledger.merge(other)
-        return ledger
 
 
 def _thing(entry: LedgerEntry) -> tuple[str, ...]:

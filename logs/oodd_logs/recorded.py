@@ -167,7 +167,7 @@ class StampedRows:
         self._recipe, self._ledger = recipe, ledger
         self.labels: LabelCounts = {}
         self.topics = {
-            name: TopicRows(recorded.recording, name, selection, recipe, ledger, recorded.label)
+            name: TopicRows(recorded.recording, name, selection, recipe, ledger)
             for name in selection.topics
         }
         is_timed = bool(recipe.time) or recipe.rate is not None

@@ -8,7 +8,6 @@ import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any, Final, cast
 
 import numpy as np
@@ -51,19 +50,11 @@ class TopicRows:
     recipe
         Says what missing values do; text among numbers is missing.
     ledger
-        Takes what is held and dropped.
-    label
-        Name of the recording in the ledger.
+        Of the recording; takes what is held and dropped.
     """
 
     def __init__(
-        self,
-        recording: Recording,
-        name: str,
-        selection: Selection,
-        recipe: Recipe,
-        ledger: Ledger,
-        label: str,
+        self, recording: Recording, name: str, selection: Selection, recipe: Recipe, ledger: Ledger
     ) -> None:
         self._topic, self._source = recording.topics[name], recording.source
         self._count = self._topic.rows
@@ -75,7 +66,7 @@ class TopicRows:
         # What a last action led to was not recorded: it may be missing.
         self._may_end = np.array([i >= len(selection.sensors) for i in self.indices], bool)
         self._policy, self._most = recipe.missing, recipe.missing_rows
-        self._say = partial(ledger.add, source=label)
+        self._say = ledger.add
         self._position = 0
         self._last = np.full(len(self._columns), np.nan)
         self._runs = np.zeros(len(self._columns), np.int64)
@@ -277,9 +268,9 @@ class Converter:
                     converted[i] = key
         order = [i for i in range(len(quantities)) if i in by_first or i not in converted]
         self._parts = [
-            by_first.get(i, Conversion((i,), (quantities[i],), _as_it_is)) for i in order
+            by_first.get(i, Conversion((i,), (quantities[i],), lambda: np.asarray)) for i in order
         ]
-        self._made = [part.make() for part in self._parts]
+        self._made: list[Callable[[Matrix], Matrix]] = []
         self.sensors = tuple(quantity for part in self._parts for quantity in part.outputs)
         for sensor in self.sensors:
             if sensor.role == "angle" and sensor.unit in FULL_TURN:
@@ -308,22 +299,16 @@ class Converter:
             What messages call the recording, and the row of the first cells.
         """
         sensors, actions = self._inputs
-        out = np.zeros((len(cells), self.width))
-        at = 0
         if not first:
             self._made = [part.make() for part in self._parts]
-        for part, make in zip(self._parts, self._made, strict=True):
-            out[:, at : at + len(part.outputs)] = make(cells[:, part.inputs])
-            at += len(part.outputs)
-        commands = cells[:, sensors : sensors + actions]
+        pairs = zip(self._parts, self._made, strict=True)
+        blocks = [make(cells[:, part.inputs]) for part, make in pairs]
+        commands, rewards = np.split(cells[:, sensors:], [actions], axis=1)
         if self._choices is not None:
             self._choices |= {*np.unique(commands).tolist()[: _MOST_CHOICES + 1]}
-            is_few = len(self._choices) <= _MOST_CHOICES
-            self._choices = self._choices if is_few else None
-        out[:, at:-1] = self._one_hot(commands, source, first) if self.discrete else commands
-        if cells.shape[1] > sensors + actions:
-            out[:, -1] = cells[:, -1]
-        return out
+            self._choices = self._choices if len(self._choices) <= _MOST_CHOICES else None
+        blocks.append(self._one_hot(commands, source, first) if self.discrete else commands)
+        return np.hstack([*blocks, rewards if rewards.size else np.zeros((len(cells), 1))])
 
     @property
     def choices(self) -> int:
@@ -334,13 +319,10 @@ class Converter:
 
     def _one_hot(self, commands: Matrix, source: str, first: int) -> Matrix:
         count, codes = len(self.actions), commands[:, 0] - self._start
-        wrong = ~np.isin(codes, np.arange(count))
-        if wrong.any():
-            i = int(wrong.argmax())
-            raise TrajectoryError(
-                f"{source}: action {first + i} is {commands[i, 0]:g}, expected a whole number from "
-                f"{self._start} to {self._start + count - 1}"
-            )
+        for i in np.flatnonzero(~np.isin(codes, np.arange(count)))[:1].tolist():
+            expected = f"a whole number from {self._start} to {self._start + count - 1}"
+            problem = f"action {first + i} is {commands[i, 0]:g}, expected {expected}"
+            raise TrajectoryError(f"{source}: {problem}")
         return np.eye(count)[codes.astype(np.intp)]
 
 
@@ -375,36 +357,55 @@ def _actions(columns: Sequence[ChosenColumn], recipe: Recipe) -> tuple[Quantity,
     return tuple(Quantity(f"action {i}", "1") for i in range(recipe.discrete))
 
 
-def _as_it_is() -> Callable[[Matrix], Matrix]:
-    return lambda rows: rows
-
-
 class Spool:
     """Rows on disk until they are written into a split: a part's rows never all lie in memory.
 
     Parameters
     ----------
-    width
-        Columns of a row.
+    converter
+        Makes the rows.
     """
 
-    def __init__(self, width: int) -> None:
-        self._width, self.rows = width, 0
+    def __init__(self, converter: Converter) -> None:
+        self.converter, self._width, self.rows = converter, converter.width, 0
         # Open as long as the spool is.
         self._file = tempfile.TemporaryFile(prefix="oodd-eval-")  # noqa: SIM115
 
-    def append(self, block: Matrix) -> None:
-        """Add rows."""
-        try:
-            self._file.seek(self.rows * self._width * 8)
-            self._file.write(np.ascontiguousarray(block, "<f8").data)
-            self._file.flush()
-        except OSError as error:
-            raise OutputError(
-                f"rows cannot be kept in {tempfile.gettempdir()!r} while they are read: {error}; "
-                "the variable TMPDIR names another folder"
-            ) from error
-        self.rows += len(block)
+    def add(self, stretch: Stretch, topics: dict[str, TopicRows], source: str) -> None:
+        """Read the rows of a stretch from all topics, and add them.
+
+        Parameters
+        ----------
+        stretch
+            Numbers of the rows.
+        topics
+            The topics with chosen columns.
+        source
+            What messages call the recording.
+
+        Raises
+        ------
+        OutputError
+            When the disk is full.
+        """
+        step = max(64, _CELLS // self._width)
+        width = sum(len(rows.indices) for rows in topics.values())
+        for start in range(0, stretch.rows, step):
+            stop = min(start + step, stretch.rows)
+            cells = np.empty((stop - start, width))
+            for name, rows in topics.items():
+                cells[:, rows.indices] = rows.rows(stretch.sources[name][start:stop])
+            block = self.converter.convert(cells, source, start)
+            try:
+                self._file.seek(self.rows * self._width * 8)
+                self._file.write(np.ascontiguousarray(block, "<f8").data)
+                self._file.flush()
+            except OSError as error:
+                raise OutputError(
+                    f"rows cannot be kept in {tempfile.gettempdir()!r} while they are read: "
+                    f"{error}; the variable TMPDIR names another folder"
+                ) from error
+            self.rows += len(block)
 
     def read(self, start: int, stop: int) -> Matrix:
         """Return the rows of a range."""
@@ -416,17 +417,3 @@ class Spool:
         """Remove the rows."""
         with contextlib.suppress(OSError):  # rows that a full disk did not take
             self._file.close()
-
-
-def spool_stretch(
-    spool: Spool, stretch: Stretch, topics: dict[str, TopicRows], converter: Converter, source: str
-) -> None:
-    """Read the rows of a stretch from all topics and add them to a spool."""
-    step = max(64, _CELLS // converter.width)
-    width = sum(len(rows.indices) for rows in topics.values())
-    for start in range(0, stretch.rows, step):
-        stop = min(start + step, stretch.rows)
-        cells = np.empty((stop - start, width))
-        for name, rows in topics.items():
-            cells[:, rows.indices] = rows.rows(stretch.sources[name][start:stop])
-        spool.append(converter.convert(cells, source, start))

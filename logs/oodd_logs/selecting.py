@@ -10,6 +10,7 @@ import unicodedata
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain
 from typing import Final
 
@@ -22,6 +23,8 @@ from oodd_logs.recording import Column, Recording, Topic
 
 _PREFIX: Final = re.compile(r"\s*(obs|action)\s*:\s*(?=\S)", re.IGNORECASE)
 _UNIT: Final = re.compile(r"(.*?[^\[\]\s])\s*\[\s*([^\[\]]*[^\[\]\s])\s*\]")
+_SYMBOL: Final = r"(?:[numkMGµμ]?(?:Nm|Hz|Pa|bar|rad|[msgNAVWJlL])|°[CF]?|degC?|rpm|rev|min|[hKC%])"
+_ROUND: Final = re.compile(rf"\s*\(({_SYMBOL}(?:[ */.·^-]?(?:{_SYMBOL}|\d))*)\)\s*$")
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +87,11 @@ def layout_of(recording: Recording) -> Layout:
 
 def named_columns(layout: Layout) -> list[str]:
     """Return the columns of a layout as a recipe names them, without their units."""
-    return [_aliases(topic, name)[-1] for topic, names, _ in layout for name in names]
+    return [_aliases(topic, name)[-1] for topic, name in _pairs(layout)]
+
+
+def _pairs(layout: Layout | None) -> list[tuple[str, str]]:
+    return [(topic, name) for topic, names, _ in layout or () for name in names]
 
 
 def split_unit(text: str) -> tuple[str, str]:
@@ -105,14 +112,28 @@ def plain_name(text: str) -> str:
     >>> plain_name("Joint\N{NO-BREAK SPACE}1 [rad]"), plain_name("joint1")
     ('joint1', 'joint1')
     """
-    letters = unicodedata.normalize("NFKC", split_unit(text)[0]).casefold()
+    letters = unicodedata.normalize("NFKC", split_unit(_in_square(text))[0]).casefold()
     return "".join(c for c in letters if not c.isspace() and unicodedata.category(c) != "Cf")
+
+
+def plain_unit(text: str) -> str:
+    """Return the unit of a column, in round brackets, too, without what spellings differ in.
+
+    >>> plain_unit("speed [m/s]"), plain_unit("speed (m/s)"), plain_unit("speed (raw)")
+    ('m/s', 'm/s', '')
+    """
+    return " ".join(unicodedata.normalize("NFKC", split_unit(_in_square(text))[1]).split())
+
+
+def _in_square(text: str) -> str:
+    return _ROUND.sub(r" [\1]", text)
 
 
 def respellings(layout: Layout, recipe: Recipe, first: Layout | None) -> dict[tuple[str, str], str]:
     """Return names for columns that are spelled otherwise than in a recipe, or the first recording.
 
-    They differ from these in case, Unicode form, blanks, or in that one of the two has no unit.
+    They differ from these in case, Unicode form, blanks, the brackets of a unit, or in that one of
+    the two has no unit.
 
     Parameters
     ----------
@@ -128,8 +149,7 @@ def respellings(layout: Layout, recipe: Recipe, first: Layout | None) -> dict[tu
     dict
         From topic and column to the name that a recipe finds.
     """
-    expected = {(topic, name) for topic, names, _ in first or () for name in names}
-    there = {(topic, name) for topic, names, _ in layout for name in names}
+    expected, there = {*_pairs(first)}, {*_pairs(layout)}
     spellings: dict[tuple[str, str], list[str]] = defaultdict(list)
     for topic, name in sorted(there - expected):
         spellings[topic, plain_name(_aliases("", name)[-1])].append(name)
@@ -137,7 +157,7 @@ def respellings(layout: Layout, recipe: Recipe, first: Layout | None) -> dict[tu
     def spelled(topic: str, text: str) -> str:
         """Return the one column that is spelled otherwise than a text; empty for none."""
         columns = spellings[topic, plain_name(text)]
-        units = {plain_unit(split_unit(name)[1]) for name in (text, *columns)} - {"", "1"}
+        units = {plain_unit(name) for name in (text, *columns)} - {"", "1"}
         return columns[0] if len(columns) == 1 and len(units) < 2 else ""
 
     pairs = [(topic, name, spelled(topic, name)) for topic, name in expected - there]
@@ -151,7 +171,8 @@ def respellings(layout: Layout, recipe: Recipe, first: Layout | None) -> dict[tu
             name = text.removeprefix(f"{topic}." if topic else "")
             (bare, unit), old = split_unit(name), spelled(topic, name)
             if old and (topic, old) not in taken:
-                new = name if unit else old.replace(split_unit(old)[0], bare)
+                squared = _in_square(old)
+                new = name if unit else squared.replace(split_unit(squared)[0], bare)
                 names.setdefault((topic, old), new)
     return names
 
@@ -161,8 +182,7 @@ def _exact(layout: Layout, text: str) -> list[tuple[str, str]]:
     glob = pattern_of(split_unit(text)[0])
     return [
         (topic, name)
-        for topic, names, _ in layout
-        for name in names
+        for topic, name in _pairs(layout)
         if text in (aliases := _aliases(topic, name)) or any(map(glob.fullmatch, aliases))
     ]
 
@@ -171,25 +191,17 @@ def respelled(recording: Recording, names: Mapping[tuple[str, str], str]) -> Rec
     """Return a recording with other names of columns, by topic and column."""
     topics = {}
     for name, topic in recording.topics.items():
-        new = {column: names.get((name, column), column) for column in topic.names}
-        topics[name] = _renamed(topic, new) if {*new} != {*new.values()} else topic
-    return dataclasses.replace(recording, topics=topics)
+        old = {names.get((name, column), column): column for column in topic.names}
+        time = names.get((name, topic.time), topic.time)
+        topics[name] = Topic(tuple(old), topic.rows, partial(_read, topic, old), time)
+    return dataclasses.replace(recording, topics=topics) if names else recording
 
 
-def _renamed(topic: Topic, names: Mapping[str, str]) -> Topic:
-    old = {new: name for name, new in names.items()}
-
-    def read(columns: Sequence[str], start: int, stop: int) -> dict[str, Column]:
-        cells = topic.read([old[name] for name in columns], start, stop)
-        return {name: cells[old[name]] for name in columns}
-
-    time = names.get(topic.time, topic.time)
-    return Topic(tuple(names.values()), topic.rows, read, time)
-
-
-def plain_unit(unit: str) -> str:
-    """Return a unit without what spellings differ in: Unicode form and blanks."""
-    return " ".join(unicodedata.normalize("NFKC", unit).split())
+def _read(
+    topic: Topic, old: Mapping[str, str], columns: Sequence[str], start: int, stop: int
+) -> dict[str, Column]:
+    cells = topic.read([old[name] for name in columns], start, stop)
+    return {name: cells[old[name]] for name in columns}
 
 
 def find_columns(layout: Layout, text: str) -> list[ChosenColumn]:
@@ -235,15 +247,11 @@ def select_columns(layout: Layout, recipe: Recipe, source: str) -> Selection:
     UsageError
         When no sensor is chosen, or two have one name.
     """
-    by_prefix = not recipe.sensors
-    if by_prefix:
-        sensors, actions, rewards = _by_prefix(layout, source, explicit=bool(recipe.actions))
-    else:
-        sensors, actions, rewards = _listed(layout, recipe.sensors, source), [], []
-    if recipe.actions:
-        actions = _listed(layout, recipe.actions, source)
-    if recipe.reward:
-        rewards = _listed(layout, (recipe.reward,), source)
+    rewards_text = (recipe.reward,) if recipe.reward else ()
+    texts = {"obs": recipe.sensors, "action": recipe.actions, "reward": rewards_text}
+    chosen = {kind: _listed(layout, names, source) for kind, names in texts.items()}
+    by_prefix = {} if recipe.sensors else _by_prefix(layout, source)
+    sensors, actions, rewards = (chosen[kind] or by_prefix.get(kind, []) for kind in texts)
     for kind, columns in (("sensors", sensors), ("actions", actions)):
         names = [column.quantity.name for column in columns]
         if double := [name for name in names if names.count(name) > 1]:
@@ -256,9 +264,8 @@ def select_columns(layout: Layout, recipe: Recipe, source: str) -> Selection:
     used = [*sensors, *actions, *rewards[:1], *labels.values()]
     times = _times(layout, dict.fromkeys(column.topic for column in used), recipe.time, source)
     named = {(c.topic, c.column) for c in (*used, *fields, *chain(*times.values()))}
-    layout_columns = [(topic, name) for topic, names, _ in layout for name in names]
-    unused = tuple(_aliases(*column)[-1] for column in layout_columns if column not in named)
-    if by_prefix:
+    unused = tuple(_aliases(*column)[-1] for column in _pairs(layout) if column not in named)
+    if not recipe.sensors:
         _check_spelling(source, unused)
     reward = rewards[0] if rewards else None
     return Selection(tuple(sensors), tuple(actions), reward, times, labels, unused)
@@ -273,7 +280,7 @@ def _texts_of(recipe: Recipe) -> list[str]:
 
 def unnamed_columns(layout: Layout, recipe: Recipe) -> tuple[str, ...]:
     """Return the columns that no key of a recipe without sensors names; none with ``obs:`` ones."""
-    columns = [(topic, name) for topic, names, _ in layout for name in names]
+    columns = _pairs(layout)
     if any((match := _PREFIX.match(name)) and match[1].lower() == "obs" for _, name in columns):
         return ()
     texts = [*recipe.actions, *_texts_of(recipe), *recipe.time, *filter(None, [recipe.reward])]
@@ -282,26 +289,23 @@ def unnamed_columns(layout: Layout, recipe: Recipe) -> tuple[str, ...]:
     return tuple(f"{topic}.{name}" if topic else name for topic, name in unnamed)
 
 
-def _by_prefix(
-    layout: Layout, source: str, *, explicit: bool
-) -> tuple[list[ChosenColumn], list[ChosenColumn], list[ChosenColumn]]:
-    """Return the columns ``obs:NAME[UNIT]``, ``action:NAME[UNIT]`` and ``reward``."""
+def _by_prefix(layout: Layout, source: str) -> dict[str, list[ChosenColumn]]:
+    """Return the columns ``obs:NAME[UNIT]``, ``action:NAME[UNIT]`` and ``reward``, by kind."""
     by_kind: dict[str, list[ChosenColumn]] = {"obs": [], "action": [], "reward": []}
-    for topic, columns, _ in layout:
-        for name in columns:
-            match = _PREFIX.match(name)
-            kind = match[1].lower() if match else name.strip().lower()
-            if match or kind == "reward":
-                label, unit = _named_unit(name[match.end() :] if match else name)
-                by_kind[kind].append(ChosenColumn(topic, name, Quantity(label, unit or "1")))
+    for topic, name in _pairs(layout):
+        match = _PREFIX.match(name)
+        kind = match[1].lower() if match else name.strip().lower()
+        if match or kind == "reward":
+            label, unit = _named_unit(name[match.end() :] if match else name)
+            by_kind[kind].append(ChosenColumn(topic, name, Quantity(label, unit or "1")))
     if not by_kind["obs"]:
-        _check_spelling(source, [name for _, columns, _ in layout for name in columns])
+        _check_spelling(source, [name for _, name in _pairs(layout)])
         names = ", ".join(named_columns(layout))
         raise UsageError(
             f"{source} has the columns {names or 'none'}: none is called "
             "obs:NAME[UNIT], so name the sensors in a recipe (sensors = [...]), actions, too"
         )
-    return by_kind["obs"], [] if explicit else by_kind["action"], by_kind["reward"]
+    return by_kind
 
 
 def _check_spelling(source: str, names: Iterable[str]) -> None:
@@ -330,7 +334,7 @@ def _times(
     layout: Layout, topics: Iterable[str], texts: Sequence[str], source: str
 ) -> dict[str, tuple[ChosenColumn, ...]]:
     """Return the columns with stamps by topic, as the recipe names them, else as the format."""
-    found: dict[str, list[ChosenColumn]] = {topic: [] for topic, _, _ in layout}
+    stamps: dict[str, list[ChosenColumn]] = defaultdict(list)
     for text in texts:
         columns = {column.topic: column for column in find_columns(layout, text)}
         for topic, names, _ in layout:
@@ -341,15 +345,19 @@ def _times(
             name = split_unit(text)[0]
             raise UnknownNameError(f"column of {source}", name, named_columns(layout))
         for topic, column in columns.items():
-            found[topic].append(column)
-    times: dict[str, tuple[ChosenColumn, ...]] = {}
-    for topic, _, time in layout:
-        defined = (ChosenColumn(topic, time, Quantity(time, "s")),) if time else ()
-        times[topic] = tuple(found[topic]) if texts and len(found[topic]) == len(texts) else defined
-    if texts and (without := [topic for topic in topics if not times[topic]]):
+            stamps[topic].append(column)
+    times: dict[str, tuple[ChosenColumn, ...]] = {
+        topic: (ChosenColumn(topic, time, Quantity(time, "s")),)
+        for topic, _, time in layout
+        if time
+    }
+    times |= {
+        topic: tuple(columns) for topic, columns in stamps.items() if len(columns) == len(texts)
+    }
+    if texts and (without := [topic for topic in topics if topic not in times]):
         absent = " and ".join(map(repr, texts))
         raise TrajectoryError(f"{source}: topic {without[0]!r} has no column {absent}, its stamps")
-    return {topic: times[topic] for topic in topics if times[topic]}
+    return {topic: times[topic] for topic in topics if topic in times}
 
 
 def _named_unit(text: str) -> tuple[str, str]:
@@ -370,19 +378,14 @@ def _aliases(topic: str, column: str) -> list[str]:
 def _matches(layout: Layout, text: str) -> list[ChosenColumn]:
     """Return the columns that a glob without a new name matches, with the unit it names."""
     stripped = text.strip()
-    readings = dict.fromkeys([(stripped, ""), split_unit(stripped), _named_unit(stripped)])
+    readings = [(stripped, ""), split_unit(stripped)]
     if {*stripped} & {*"*?"}:  # columns with the unit and without it
-        readings = dict.fromkeys([split_unit(stripped), (stripped, ""), _named_unit(stripped)])
-    for pattern, unit in readings:
+        readings.reverse()
+    for pattern, unit in dict.fromkeys([*readings, _named_unit(stripped)]):
         glob = pattern_of(pattern)
-        columns = [
-            _with_unit(topic, name, unit)
-            for topic, names, _ in layout
-            for name in names
-            if any(map(glob.fullmatch, _aliases(topic, name)))
-        ]
-        if columns:
-            return columns
+        matches = [pair for pair in _pairs(layout) if any(map(glob.fullmatch, _aliases(*pair)))]
+        if matches:
+            return [_with_unit(topic, name, unit) for topic, name in matches]
     return []
 
 

@@ -395,7 +395,7 @@ class Inspection:
             if names[name] in self.columns:
                 continue
             known = self._spellings.setdefault((below, plain_name(name)), names[name])
-            units = {plain_unit(split_unit(text)[1]) for text in (known, name)} - {""}
+            units = {plain_unit(text) for text in (known, name)} - {""}
             if known not in whole and len(units) < 2:
                 self._written.setdefault(known, {}).setdefault(names[name], []).append(file)
                 names[name] = known
