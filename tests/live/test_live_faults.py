@@ -168,12 +168,12 @@ def test_readings_come_by_name_too():
 
 
 MISSING = {
-    "masked": np.ma.masked_array([0.1, 9999.0, 1.0], [0, 1, 0]),
+    "masked": np.ma.masked_array([0.0, 9999.0, 1.0], [0, 1, 0]),
     "masked whole numbers": np.ma.masked_array([0, 9999, 1], [0, 1, 0]),
-    "masked in a list": [0.1, np.ma.masked, 1.0],
-    "None": [0.1, None, 1.0],
-    "None by name": {"x": 0.1, "y": None, "contact": 1.0},
-    "masked by name": {"x": 0.1, "y": np.ma.masked, "contact": 1.0},
+    "masked in a list": [0.0, np.ma.masked, 1.0],
+    "None": [0.0, None, 1.0],
+    "None by name": {"x": 0.0, "y": None, "contact": 1.0},
+    "masked by name": {"x": 0.0, "y": np.ma.masked, "contact": 1.0},
 }
 
 
@@ -184,7 +184,7 @@ def test_what_is_missing_in_any_form_is_no_reading(offset, form):
     names = ["x", "y", "contact"]
     watchdog = Watchdog.fit("mahalanobis", episodes, episodes, 0.1, sensors=names)
     assert bool(watchdog._nominal.offsets.any()) == bool(offset)
-    expected = watchdog.update([0.1, np.nan, 1.0])
+    expected = watchdog.update([0.0, np.nan, 1.0])
     watchdog.reset()
     assert watchdog.update(MISSING[form]) == expected
     for _ in range(6):

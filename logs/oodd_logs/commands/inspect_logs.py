@@ -16,7 +16,7 @@ from oodd_logs.inspection.draft import draft
 from oodd_logs.inspection.logs import Inspection, inspect_logs, refuse_logs
 from oodd_logs.inspection.meaning import window_of
 from oodd_logs.inspection.report import as_json, describe_logs
-from oodd_logs.scanning.limits import FITS, SHORTEST, WINDOWS
+from oodd_logs.scanning.limits import SHORTEST, WINDOWS
 from oodd_logs.scanning.outliers import LEAST
 
 _NO_SENSOR: Final = (
@@ -88,7 +88,7 @@ def _scan(options: Options, logs: Inspection) -> str:
     command += [f"--read={key}={json.dumps(value)}" for key, value in options.read]
     rows = logs.recordings[0].length
     if len(logs.recordings) == 1 and not window_of(logs) and rows < WINDOWS * LEAST:
-        window = max(SHORTEST, rows // FITS)
+        window = max(SHORTEST, rows // (WINDOWS // 2))
         if rows < window * LEAST:
             return ""
         command.append(f"--window={window}")
