@@ -8,7 +8,7 @@ float32 cannot tell apart.
 import contextlib
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -45,34 +45,6 @@ _NEAR: Final = 0.001  # share by which a period is rounded
 
 
 @dataclass(slots=True)
-class Turns:
-    """Steps of a column in one recording by their sizes, compared with the range of the column.
-
-    Parameters
-    ----------
-    jumps, wild
-        Number of steps of about the range, and of others of more than an eighth of it.
-    jumped, size
-        Sum of the jumps, and of their sizes.
-    moved
-        Sum of all other steps.
-    small, walked
-        Number of the other steps in blocks with jumps, and the sum of their sizes.
-    counts
-        Whether all other steps are 1.
-    """
-
-    jumps: int = 0
-    wild: int = 0
-    jumped: float = 0.0
-    size: float = 0.0
-    moved: float = 0.0
-    small: int = 0
-    walked: float = 0.0
-    counts: bool = True
-
-
-@dataclass(slots=True)
 class ColumnFacts:
     """Contents of one column, over all recordings that have it.
 
@@ -99,14 +71,16 @@ class ColumnFacts:
     span
         Range of the numbers on which `turns` are based.
     turns
-        Steps by their sizes, of each recording, or block of several.
+        Steps by their sizes, of each recording, or block of several: number of jumps of about the
+        range, and of others of more than an eighth of it, sums of the jumps, of their sizes, of all
+        other steps, of the sizes of these, and the number of all.
     sources, firsts
         The recordings whose cells are taken, and the first cell of each.
     recent, filled
         Of each of these, cells by value as in `values`, and whether it has a number.
-    run, at_start, last
-        Missing cells before the next one, whether there was none but these in the recording, and
-        its last number.
+    run, at_start, last, row
+        Missing cells before the next one, whether there was none but these in the recording, its
+        last number, and its next row.
     """
 
     recordings: int = 0
@@ -123,7 +97,7 @@ class ColumnFacts:
     falls: int = 0
     rises: int = 0
     span: float = 0.0
-    turns: list[Turns] = field(default_factory=list)
+    turns: list[NDArray[np.float64]] = field(default_factory=list)
     sources: Sequence[str] = ()
     firsts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(1, np.int64))
     recent: list[Counter[float | str]] = field(default_factory=list)
@@ -131,6 +105,7 @@ class ColumnFacts:
     run: int = 0
     at_start: bool = True
     last: float = math.nan
+    row: int = 0
 
     def begin(self, sources: Sequence[str] = ("",), firsts: NDArray[np.int64] = _WHOLE) -> None:
         """Say that the next cells are of another recording, or of several in one block.
@@ -143,17 +118,17 @@ class ColumnFacts:
             Position of the first cell of each.
         """
         self.recordings += len(sources)
-        self.turns.append(Turns())
+        self.turns.append(np.zeros(7))
         self.sources, self.firsts = sources, firsts
         self.recent, self.filled = [Counter() for _ in sources], np.zeros(len(sources), np.bool_)
-        self.run, self.at_start, self.last = 0, True, math.nan
+        self.run, self.at_start, self.last, self.row = 0, True, math.nan, 0
 
-    def leap(self) -> None:
-        """Say that rows before the next cells were left out."""
-        self.run, self.at_start, self.last = 0, False, math.nan
-
-    def add(self, cells: Column, start: int = 0) -> None:
-        """Take the next cells of the recording, from some row on."""
+    def add(self, cells: Column, start: int | None = None) -> None:
+        """Take cells of the recording from some row on, by default the next one."""
+        start = self.row if start is None else start
+        if start != self.row:
+            self.run, self.at_start, self.last = 0, False, math.nan
+        self.row = start + len(cells)
         numbers = cells
         self.cells += len(cells)
         if cells.dtype.kind == "U":
@@ -165,137 +140,107 @@ class ColumnFacts:
                 self._count_values(cells, ~absent)
                 return
             self._count_values(cells, words)
-        absent = ~np.isfinite(numbers)
-        self._count_missing(absent)
-        present = numbers
-        if absent.any():
-            present = numbers[~absent]
-            self._except(_INFINITE, np.isinf(numbers), cells, start)
-        if not len(present):
+        present = np.isfinite(numbers)
+        self._count_missing(~present)
+        self._except(_INFINITE, np.isinf(numbers), cells, start)
+        if not present.any():
             return
-        self._count_values(numbers, ~absent)
-        self.numbers.add(present)
-        self._count_codes(present, numbers)
-        self.filled |= np.logical_or.reduceat(~absent, self.firsts)
-        inside = np.diff(np.searchsorted(self.firsts, np.flatnonzero(~absent), side="right")) == 0
-        if self._count_steps(present, inside if len(self.sources) > 1 else None):
-            away = np.abs(numbers - np.median(present))
-            usual = np.median(away[~absent])
-            beyond = ~absent & (away > _FAR * usual)
-            if usual > 0 and beyond.sum() <= 1 + len(present) // 100:
+        self._count_values(numbers, present)
+        self.numbers.add(numbers[present])
+        self._count_codes(numbers, present)
+        self.filled |= np.logical_or.reduceat(present, self.firsts)
+        if self._count_steps(numbers, present):
+            away = np.abs(numbers - np.median(numbers[present]))
+            usual = np.median(away[present])
+            beyond = present & (away > _FAR * usual)
+            if usual > 0 and beyond.sum() <= 1 + present.sum() // 100:
                 self._except(_BEYOND, beyond, cells, start)
 
     def _except(self, reason: str, cells: NDArray[np.bool_], values: Column, start: int) -> None:
         """Keep how many cells of a recording are no such values as the others, and the first."""
-        for i, rows in self._by_recording(np.flatnonzero(cells)):
-            source, row = self.sources[i], int(rows[0])
-            place = 0, start + row - int(self.firsts[i]), f"{values[row]!s:.60}"
-            count, first, text = self.exceptions.get((reason, source), place)
-            self.exceptions[reason, source] = (count + len(rows), first, text)
+        rows = np.flatnonzero(cells)
+        recordings = np.searchsorted(self.firsts, rows, side="right") - 1
+        for i, first, count in zip(
+            *np.unique(recordings, return_index=True, return_counts=True), strict=True
+        ):
+            row, key = int(rows[first]), (reason, self.sources[i])
+            fresh = 0, start + row - int(self.firsts[i]), f"{values[row]!s:.60}"
+            before, *first_cell = self.exceptions.get(key, fresh)
+            self.exceptions[key] = (before + int(count), *first_cell)
 
-    def _by_recording(self, cells: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64]]]:
-        """Yield the number of each recording with some of these cells, and its cells."""
-        recordings = np.searchsorted(self.firsts, cells, side="right") - 1
-        for i in np.unique(recordings).tolist():
-            yield i, cells[recordings == i]
-
-    def _count_codes(self, present: NDArray[np.float64], numbers: NDArray[np.float64]) -> None:
+    def _count_codes(self, numbers: NDArray[np.float64], present: NDArray[np.bool_]) -> None:
         """Count cells that may stand for a missing value, and keep where most others are."""
-        if NUMBERS.isdisjoint((float(present.min()), float(present.max()))):
+        if NUMBERS.isdisjoint((float(numbers[present].min()), float(numbers[present].max()))):
             return
         coded = np.isin(numbers, [*NUMBERS])
-        for i, rows in self._by_recording(np.flatnonzero(coded)):
-            for code in numbers[rows].tolist():
-                self.codes.setdefault(code, Counter())[self.sources[i]] += 1
-        others = numbers[np.isfinite(numbers) & ~coded]
-        if len(others):
+        recordings = np.searchsorted(self.firsts, np.flatnonzero(coded), side="right") - 1
+        for code, i in zip(numbers[coded].tolist(), recordings.tolist(), strict=True):
+            self.codes.setdefault(code, Counter())[self.sources[i]] += 1
+        if (others := numbers[present & ~coded]).size:
             low, high = np.percentile(others, (1, 99)).tolist()
             self.inner.append((low, high))
 
     def _count_missing(self, absent: NDArray[np.bool_]) -> None:
         if not absent.any():
-            self.longest = max(self.longest, 0 if self.at_start else self.run)
-            self.run, self.at_start = 0, self.at_start and not len(absent)
+            self.run, self.at_start = 0, False
             return
         self.missing += int(absent.sum())
         for part in np.split(absent, self.firsts[1:]):
             if len(self.sources) > 1:
                 self.run, self.at_start = 0, True
-            for start, stop in runs_of(part):
-                length = stop - start + (self.run if start == 0 else 0)
-                if self.at_start and start == 0:
+            for first, stop in runs_of(part):
+                length = stop - first + (self.run if first == 0 else 0)
+                if self.at_start and first == 0:
                     self.leading = max(self.leading, length)
                 else:
                     self.longest = max(self.longest, length)
-            trailing = int(part[::-1].argmin()) if not part.all() else len(part)
-            self.run = trailing + (self.run if trailing == len(part) else 0)
-            self.at_start = self.at_start and trailing == len(part)
+            # The run goes on in the next block.
+            self.at_start = self.at_start and bool(part.all())
+            self.run = len(part) + self.run if part.all() else int(part[::-1].argmin())
 
-    def _count_values(self, cells: Column, where: NDArray[np.bool_]) -> None:
-        if self.values is None or not where.any():
+    def _count_values(self, cells: Column, present: NDArray[np.bool_]) -> None:
+        if self.values is None or len({*cells[present][:1000].tolist()}) > FEW:
+            self.values = None
             return
-        present = cells[where]
-        if len({*present[:1000].tolist()}) <= FEW:
-            values, codes = np.unique(present, return_inverse=True)
-            if len(values) <= FEW:
-                recordings = np.searchsorted(self.firsts, np.flatnonzero(where), side="right") - 1
-                size = len(self.sources) * len(values)
-                counts = np.bincount(recordings * len(values) + codes, minlength=size)
-                for recent, of_recording in zip(
-                    self.recent, counts.reshape(-1, len(values)).tolist(), strict=True
-                ):
-                    pairs = zip(values.tolist(), of_recording, strict=True)
-                    recent.update({value: count for value, count in pairs if count})
-                self.values.update(
-                    dict(zip(values.tolist(), np.bincount(codes).tolist(), strict=True))
-                )
-                if len(self.values) <= FEW:
-                    return
-        self.values = None
+        parts = zip(*(np.split(x, self.firsts[1:]) for x in (cells, present)), strict=True)
+        for recent, (values, there) in zip(self.recent, parts, strict=True):
+            counts = Counter(values[there].tolist())
+            recent.update(counts)
+            self.values.update(counts)
+            if len(self.values) > FEW:
+                self.values = None
+                return
 
-    def _count_steps(self, numbers: NDArray[np.float64], inside: NDArray[np.bool_] | None) -> bool:
+    @np.errstate(all="ignore")
+    def _count_steps(self, numbers: NDArray[np.float64], present: NDArray[np.bool_]) -> bool:
         """Count steps by their sizes; tell whether one is much larger than the others.
 
         Steps count that are inside a recording.
         """
-        joined = numbers if math.isnan(self.last) else np.append(self.last, numbers)
-        with np.errstate(all="ignore"):
-            steps = np.diff(joined)
-        if inside is not None:
-            steps = steps[inside]
-        self.last = float(numbers[-1])
+        recordings = np.searchsorted(self.firsts, np.flatnonzero(present), side="right")
+        joined = numbers[present]
+        if not math.isnan(self.last):
+            joined, recordings = np.append(self.last, joined), np.append(1, recordings)
+        self.last = float(joined[-1])
+        steps = np.diff(joined)[np.diff(recordings) == 0]
         self.steps += len(steps)
         span = self.numbers.high - self.numbers.low
         if span > 1.2 * self.span:  # what seemed to be jumps was none
             self.span = span
             for turns in self.turns:
-                turns.moved += turns.jumped
-                turns.jumps, turns.wild, turns.jumped, turns.size = 0, 0, 0.0, 0.0
+                turns[4:6] += turns[2:4]
+                turns[:4] = 0.0
         if not len(steps) or not 0 < span < np.inf:
             return False
-        least, largest = steps.min(), steps.max()
-        self.falls += int((steps < 0).sum()) if least < 0 else 0
-        self.rises += int((steps > 0).sum()) if largest > 0 else 0
-        if sum(t.wild for t in self.turns[-3:]) > 16 + 4 * sum(t.jumps for t in self.turns[-3:]):
-            self.turns[-1].wild += 1  # noise, of which nothing more need be known
-            return False
-        turns, moved = self.turns[-1], float(steps.sum())
-        if max(largest, -least) <= span / 8:
-            turns.moved += moved
-            turns.counts = turns.counts and least == largest == 1
-            return False
+        self.falls += int((steps < 0).sum())
+        self.rises += int((steps > 0).sum())
         sizes = np.abs(steps)
         jumps = sizes > _JUMP * span
-        jumped, others = steps[jumps], steps[~jumps]
-        turns.jumps += len(jumped)
-        turns.jumped += float(jumped.sum())
-        turns.size += float(sizes[jumps].sum())
-        turns.moved += moved - float(jumped.sum())
-        turns.small += len(others)
-        turns.walked += float(np.abs(others).sum())
-        turns.wild += int((sizes > span / 8).sum()) - len(jumped)
-        turns.counts = turns.counts and bool((others == 1).all())
-        return bool(max(largest, -least) > 0.2 * sizes.sum())
+        sums = np.array([steps[jumps].sum(), sizes[jumps].sum(), steps.sum(), sizes.sum()])
+        sums[2:] -= sums[:2]
+        wild = (sizes > span / 8).sum() - jumps.sum()
+        self.turns[-1] += [jumps.sum(), wild, *sums, len(steps)]
+        return bool(sizes.max() > max(span / 8, 0.2 * sizes.sum()))
 
     @property
     def text(self) -> bool:
@@ -327,7 +272,8 @@ class ColumnFacts:
         """True if the numbers rise from nearly every row to the next and never fall."""
         if self.text or self.steps <= FEW or self.rises <= self.steps / 2:
             return False
-        begins_anew = self.period and all(turns.counts for turns in self.turns)
+        jumps, *_, moved, _, steps = np.sum(self.turns, axis=0)
+        begins_anew = self.period and self.falls == jumps and moved == steps - jumps
         return bool(not self.falls or begins_anew)
 
     @property
@@ -345,33 +291,32 @@ class ColumnFacts:
         """
         if self.flag or self.text or not self.turns:
             return 0.0
-        jumping = [turns for turns in self.turns if turns.jumps]
-        jumps = sum(turns.jumps for turns in jumping)
-        if not jumps or sum(turns.wild for turns in self.turns) > jumps:
+        jumps, wild, jumped, size, moved, walked, steps = np.transpose(self.turns)
+        jumping = jumps > 0
+        if not jumping.any() or wild.sum() > jumps.sum():
             return 0.0
-        jump = sum(turns.size for turns in jumping) / jumps
-        slow = sum(abs(turns.moved) for turns in self.turns) / max(1, self.steps)
-        span = self.numbers.high - self.numbers.low
+        jump = float(size.sum() / jumps.sum())
+        slow = float(np.abs(moved).sum() / self.steps)
+        span = float(self.numbers.high - self.numbers.low)
         for period in _PERIODS[:2]:
             if abs(jump - period) < 0.08 * period and 0.9 * period < span < 1.3 * period:
                 return period
-        usual_step = sum(turns.walked for turns in jumping) / max(1, sum(t.small for t in jumping))
+        usual_step = float(walked[jumping].sum() / max(1, (steps - jumps)[jumping].sum()))
         if jump + 3 * usual_step < 0.98 * span:
             return 0.0
-        powers = [2.0**k for k in range(8, 33)]
-        if any(0.98 * power < span <= power for power in powers):
-            return min(power for power in powers if power >= span)
+        power = 2.0 ** min(max(math.ceil(math.log2(span)), 8), 32)
+        if 0.98 * power < span <= power:
+            return power
         # From the end to the beginning and through the range again, not to and fro.
-        least = 0.3 * span
-        through = [t for t in jumping if abs(t.jumped) > 0.6 * t.size and t.jumped * t.moved < 0]
-        if 2 * sum(abs(turns.moved) > least for turns in through) < len(jumping):
+        through = (np.abs(jumped) > 0.6 * size) & (jumped * moved < 0) & (abs(moved) > 0.3 * span)
+        if 2 * through.sum() < jumping.sum():
             return 0.0
         likely, most = max(span, jump + slow), max(span, jump) + 3 * usual_step
         usual = [*_PERIODS, *(10.0**k for k in range(-3, 10))]
         if fitting := [p for p in usual if 0.999 * max(span, jump) <= p <= 1.01 * most]:
             return min(fitting, key=lambda period: abs(period - likely))
         rounded = (float(f"{likely:.{digits}g}") for digits in range(1, 6))
-        return next((p for p in rounded if abs(p / likely - 1) < _NEAR), float(likely))
+        return next((p for p in rounded if abs(p / likely - 1) < _NEAR), likely)
 
     @property
     def coarse(self) -> bool:
@@ -426,13 +371,9 @@ class ClockFacts:
         unit = "date" if dated else units[0]
         readings: dict[str, ClockFacts] = {}
         for order in orders or [""]:
-            seconds = [
-                parse_times(cells, of_column, order)
-                for cells, of_column in zip(columns, units, strict=False)
-            ]
-            times = past_midnight(seconds[0]) if dated else seconds[0]
-            if len(columns) > 1:
-                times = seconds[0] + seconds[1]
+            columns_and_units = zip(columns, units, strict=False)
+            times = np.sum([parse_times(*pair, order) for pair in columns_and_units], axis=0)
+            times = past_midnight(times) if dated else times
             present = np.isfinite(times)
             times = times[present]
             if len(times) < 2:

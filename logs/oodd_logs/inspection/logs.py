@@ -1,12 +1,13 @@
 """Contents of logs: recordings, their columns and clocks, and files that are not as the others."""
 
 import contextlib
+import functools
 import hashlib
 import itertools
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
@@ -59,53 +60,30 @@ _DAY: Final = 86400  # seconds
 _INTERVALS: Final = ({"file", "start"}, {"file", "onset"})
 
 
-class _RowHashes:
-    """What tells the rows of a recording from those of others: all of them, the first, the last."""
-
-    def __init__(self) -> None:
-        self.digest, self._names = hashlib.sha256(), [""]
-        self.head = self.tail = np.empty(0, np.uint64)
-
-    def begin(self, block: Mapping[str, Column], times: Collection[str]) -> None:
-        """Choose the columns that tell rows apart, from the first block of a topic."""
-        numbers = (n for n in block if block[n].dtype.kind == "f" and n not in times)
-        self._names = sorted(n for n in numbers if len({*block[n][:1000].tolist()}) > FEW)
-
-    def add(self, block: Mapping[str, Column]) -> None:
-        """Take the next rows of the topic."""
-        for cells in block.values():
-            self.digest.update(cells.tobytes())
-        hashes = np.zeros(len(next(iter(block.values()))) if self._names else 0, np.uint64)
-        for name in self._names:
-            hashes = hashes * _PRIME ^ np.ascontiguousarray(block[name]).view(np.uint64)
-        self.head = np.append(self.head, hashes[: _ENDS - len(self.head)])
-        self.tail = np.append(self.tail, hashes)[-_ENDS:]
-
-
-@dataclass(frozen=True, slots=True)
+@dataclass(eq=False, slots=True)
 class RecordingFacts:
     """Contents of one recording.
 
     Parameters
     ----------
-    name, source
+    name
         As the reader names it.
     file
         Its file, relative to the path that was inspected.
     rows
         Number of rows of each topic.
+    fields
+        Values that hold for the whole recording.
+    stamps
+        Columns that the format defines to be times in seconds.
     columns
         Names of its columns, below their topics if there are several.
     clocks
         Facts of the columns that may have times, by name.
-    stamps
-        Columns that the format defines to be times in seconds.
     added
         Columns whose times are added to those of others, such as times of day, by these.
     values
         Cells by value, of each column with few values.
-    fields
-        Values that hold for the whole recording.
     empty
         Columns without a number in it.
     digest
@@ -115,35 +93,41 @@ class RecordingFacts:
     """
 
     name: str
-    source: str
     file: str
     rows: Mapping[str, int]
-    columns: tuple[str, ...]
-    clocks: Mapping[str, ClockFacts]
-    stamps: frozenset[str]
-    added: Mapping[str, str]
-    values: Mapping[str, Mapping[float | str, int]]
     fields: Mapping[str, Any]
-    empty: set[str]
-    digest: str
-    head: NDArray[np.uint64]
-    tail: NDArray[np.uint64]
+    stamps: frozenset[str]
+    columns: tuple[str, ...] = ()
+    clocks: dict[str, ClockFacts] = field(default_factory=dict)
+    added: dict[str, str] = field(default_factory=dict)
+    values: dict[str, Mapping[float | str, int]] = field(default_factory=dict)
+    empty: set[str] = field(default_factory=set)
+    digest: bytes = b""
+    head: NDArray[np.uint64] = field(default_factory=lambda: np.empty(0, np.uint64))
+    tail: NDArray[np.uint64] = field(default_factory=lambda: np.empty(0, np.uint64))
 
     @property
     def length(self) -> int:
         """Rows of the longest topic."""
         return max(self.rows.values(), default=0)
 
-    def renamed(self, new: Mapping[str, str]) -> "RecordingFacts":
-        """Return the facts with other names of columns."""
-        return replace(
-            self,
-            columns=tuple(new.get(name, name) for name in self.columns),
-            clocks={new.get(name, name): clock for name, clock in self.clocks.items()},
-            added={new.get(name, name): new.get(n, n) for name, n in self.added.items()},
-            values={new.get(name, name): values for name, values in self.values.items()},
-            empty={new.get(name, name) for name in self.empty},
-        )
+    def hash_rows(self, block: Mapping[str, Column], names: Sequence[str]) -> None:
+        """Take the next rows, which the columns of some names tell from others."""
+        cells = (cells.tobytes() for cells in block.values())
+        self.digest = hashlib.sha256(b"".join([self.digest, *cells])).digest()
+        hashes = np.zeros(len(next(iter(block.values()))) if names else 0, np.uint64)
+        for name in names:
+            hashes = hashes * _PRIME ^ np.ascontiguousarray(block[name]).view(np.uint64)
+        self.head = np.append(self.head, hashes[: _ENDS - len(self.head)])
+        self.tail = np.append(self.tail, hashes)[-_ENDS:]
+
+    def rename(self, new: Mapping[str, str]) -> None:
+        """Give columns other names."""
+        self.columns = tuple(new.get(name, name) for name in self.columns)
+        self.clocks = {new.get(name, name): clock for name, clock in self.clocks.items()}
+        self.added = {new.get(name, name): new.get(n, n) for name, n in self.added.items()}
+        self.values = {new.get(name, name): values for name, values in self.values.items()}
+        self.empty = {new.get(name, name) for name in self.empty}
 
 
 @dataclass(eq=False)
@@ -198,9 +182,7 @@ class Inspection:
     unreadable: list[str] = field(default_factory=list)
     ledger: Ledger = field(default_factory=Ledger)
     _spellings: dict[tuple[str, str], str] = field(default_factory=dict)
-    _pending: list[tuple[str, dict[str, Column], dict[str, Counter[float | str]], set[str]]] = (
-        field(default_factory=list)
-    )
+    _pending: list[tuple[str, int, dict[str, Column], RecordingFacts]] = field(default_factory=list)
     _rowless: list[tuple[str, str]] = field(default_factory=list)
     _written: dict[str, dict[str, list[str]]] = field(default_factory=dict)
 
@@ -226,14 +208,13 @@ class Inspection:
         Of those that may be, the one that falls and stands still least in the median of the
         recordings; none where a hundredth of its steps do.
         """
-        time_columns: dict[str, str] = {}
-        best: dict[str, float] = {}
+        best: dict[str, tuple[float, str]] = {}
         for name, (falls, repeats) in self._stuck.items():
-            topic, facts = self.topic_of(name), self.columns[name]
-            share = falls + repeats
-            if share < min(0.01, best.get(topic, 1.0)) and facts.missing < facts.cells / 2:
-                time_columns[topic], best[topic] = name, share
-        clocks = {name: [clock for _, clock in self.clocks(name)] for name in time_columns.values()}
+            topic, facts, share = self.topic_of(name), self.columns[name], falls + repeats
+            most = min(0.01, best.get(topic, (1.0, ""))[0])
+            if share < most and facts.missing < facts.cells / 2:
+                best[topic] = share, name
+        clocks = {name: [clock for _, clock in self.clocks(name)] for _, name in best.values()}
         return {n: "s" if n in self.stamps else time_unit(n, c) for n, c in clocks.items()}
 
     @cached_property
@@ -254,8 +235,8 @@ class Inspection:
     @cached_property
     def standing(self) -> set[str]:
         """Columns with stamps that rise, but stand still too often for times of rows."""
-        others = {n: s for n, s in self._stuck.items() if n not in self.times}
-        return {n for n, (falls, repeats) in others.items() if falls < 0.01 <= repeats}
+        standing = {n for n, (falls, repeats) in self._stuck.items() if falls < 0.01 <= repeats}
+        return standing - {*self.times}
 
     @cached_property
     def added(self) -> dict[str, str]:
@@ -311,40 +292,32 @@ class Inspection:
     def roles(self) -> dict[str, str]:
         """Why columns are no sensors, by name: a role, or a kind; empty texts for sensors."""
         most = max((facts.cells for facts in self.columns.values()), default=0)
-        usable = [recording for recording in self.recordings if recording.file in self.usable]
-        partial = {n for r in usable for n in self._lacking(r)}
-
-        def role(name: str, facts: ColumnFacts) -> str:
-            if basic := self._basic_roles[name]:
-                return basic
-            return "partial" if name in partial else "slow" if facts.cells < SLOW * most else ""
-
-        return {name: role(name, facts) for name, facts in self.columns.items()}
+        usable = (recording for recording in self.recordings if recording.file in self.usable)
+        roles, partial = {**self._basic_roles}, {n for r in usable for n in self._lacking(r)}
+        for name in self._candidates:
+            slow = "slow" if self.columns[name].cells < SLOW * most else ""
+            roles[name] = "partial" if name in partial else slow
+        return roles
 
     @cached_property
     def _basic_roles(self) -> dict[str, str]:
         """Roles of columns regardless of the files that they are in."""
-        of_kinds: dict[str, str] = {}
-        together: set[str] = set()
+        names_by_role = {"times": {*self.times, *self.added.values()}, "labels": {*self.labels}}
+        names_by_role |= {"standing": self.standing}
+        of_kinds, together = {}, set()
         for kind, found in self.kinds.items():
             for names in found:
                 of_kinds |= dict.fromkeys(names, "" if kinds()[kind].sensor else kind)
                 together |= {*names} if len(names) > 1 else set()
-        times, labels = {*self.times, *self.added.values()}, {*self.labels}
 
         def role(name: str, facts: ColumnFacts) -> str:
-            roles = (
-                ("times", name in times),
-                ("labels", name in labels),
-                ("standing", name in self.standing),
-                ("empty", facts.empty),
-                ("text", facts.text),
-                ("", name in together),
-                ("constant", facts.constant),
-                (of_kinds.get(name, ""), bool(of_kinds.get(name))),
-                ("setpoints", facts.set_point),
-            )
-            return next((word for word, holds in roles if holds), "")
+            roles = [role for role, names in names_by_role.items() if name in names]
+            roles += [role for role in ("empty", "text") if getattr(facts, role)]
+            if roles or name in together:
+                return (roles or [""])[0]
+            if facts.constant:
+                return "constant"
+            return of_kinds.get(name) or ("setpoints" if facts.set_point else "")
 
         return {name: role(name, facts) for name, facts in self.columns.items()}
 
@@ -389,16 +362,16 @@ class Inspection:
 
     def _names(self, topic: Topic, below: str, file: str) -> dict[str, str]:
         """Return the names of a topic's columns among all, which others may spell otherwise."""
-        whole, names = {f"{below}{name}" for name in topic.names}, {}
-        for name in topic.names:
-            names[name] = f"{below}{name}"
-            if names[name] in self.columns:
+        names = {name: f"{below}{name}" for name in topic.names}
+        present = {*names.values()}
+        for name, full_name in names.items():
+            if full_name in self.columns:
                 continue
-            known = self._spellings.setdefault((below, plain_name(name)), names[name])
-            units = {plain_unit(text) for text in (known, name)} - {""}
-            if known not in whole and len(units) < 2:
-                self._written.setdefault(known, {}).setdefault(names[name], []).append(file)
-                names[name] = known
+            first = self._spellings.setdefault((below, plain_name(name)), full_name)
+            units = {plain_unit(text) for text in (first, name)} - {""}
+            if first not in present and len(units) < 2:
+                self._written.setdefault(first, {}).setdefault(full_name, []).append(file)
+                names[name] = first
         return names
 
     def settle(self, files: Sequence[str]) -> None:
@@ -416,90 +389,91 @@ class Inspection:
             self.ledger.add("file", "dropped", "no rows", source=file)
         for file, name in (pair for pair in self._rowless if pair[0] in there):
             self.ledger.add("recording", "dropped", "no rows", source=f"{file}, {name}")
+        self._name_columns()
+        for name, facts in self.columns.items():
+            for (reason, source), (count, row, cell) in facts.exceptions.items():
+                if not facts.text and name not in self.labels:
+                    at: dict[str, Any] = {"source": source, "row": row, "cell": cell}
+                    fate = EXCEPTIONS[reason]
+                    self.ledger.add("cell", fate, reason, name=name, count=count, **at)
+        for recording in (r for r in self.recordings if r.file not in self.usable):
+            lacking, file = self._lacking(recording), recording.file
+            for name in sorted(lacking & recording.empty):
+                self.ledger.add("column", "kept", "no number in it", name=name, source=file)
+            if lacking - recording.empty:
+                units = {plain_name(name): name for name in recording.columns}
+                instead = {n: units.get(plain_name(n)) for n in sorted(lacking - recording.empty)}
+                lacks = [f"{n} (it has {other})" if other else n for n, other in instead.items()]
+                self.ledger.add("file", "dropped", f"it lacks {listed(lacks)}", source=file)
+        for name, role in self.roles.items():
+            if role and role not in {"times", "labels"}:
+                self.ledger.add("column", "dropped", role_of(role).reason, name=name)
+        kept = functools.partial(self.ledger.add, "column", "kept")
+        for name in self.columns:
+            stem, unit = split_unit(name)
+            if unit and names_time(stem) and not unit_of(unit):
+                kept(f"{unit} is no unit of time, so that it has no times of rows", name=name)
+        for name, unit in self.times.items():
+            if unit not in {"date", "s", "ms", unit_in(name)}:
+                kept(f"its numbers are taken for {UNIT_NAMES[unit]} by their size", name=name)
+            clocks = (r.clocks[name] for r in self.recordings if name in r.clocks)
+            if any(len(clock.by_order) > 1 for clock in clocks):
+                kept(f"dates with the {self.date_order}", name=name)
+
+    def _name_columns(self) -> None:
+        """Name columns as most recordings do."""
         new: dict[str, str] = {}
         for name, others in self._written.items():
-            with_name = {r.file: None for r in self.recordings if name in r.columns}
-            with_name = {f: None for f in with_name if not any(f in o for o in others.values())}
-            spellings = {name: [*with_name], **others}
+            otherwise = {file for files in others.values() for file in files}
+            files = dict.fromkeys(r.file for r in self.recordings if name in r.columns)
+            spellings = {name: [file for file in files if file not in otherwise], **others}
             new[name] = max(spellings, key=lambda spelling: len(spellings[spelling]))
             for other in spellings.keys() - {new[name]}:
                 reason = f"taken from {other!r}, as the file lacks it"
                 for file in spellings[other]:
                     self.ledger.add("column", "changed", reason, name=new[name], source=file)
-        if {*new} - {*new.values()}:
-            self.columns = {new.get(name, name): facts for name, facts in self.columns.items()}
-            self.recordings = [recording.renamed(new) for recording in self.recordings]
-        for name, facts in self.columns.items():
-            if not facts.text and name not in self.labels:
-                for (reason, source), (count, row, cell) in facts.exceptions.items():
-                    place: dict[str, Any] = {"source": source, "row": row, "cell": cell}
-                    fate = EXCEPTIONS[reason]
-                    self.ledger.add("cell", fate, reason, name=name, count=count, **place)
-        for recording in (r for r in self.recordings if r.file not in self.usable):
-            for name in sorted(self._lacking(recording) & recording.empty):
-                where = recording.file
-                self.ledger.add("column", "kept", "no number in it", name=name, source=where)
-            if lacking := self._lacking(recording) - recording.empty:
-                units = {plain_name(name): name for name in recording.columns}
-                instead = {name: units.get(plain_name(name), "") for name in sorted(lacking)}
-                lacks = [f"{n} (it has {other})" if other else n for n, other in instead.items()]
-                reason = f"it lacks {listed(lacks)}"
-                self.ledger.add("file", "dropped", reason, source=recording.file)
-        for name, role in self.roles.items():
-            if role and role not in {"times", "labels"}:
-                self.ledger.add("column", "dropped", role_of(role).reason, name=name)
-        for name in self.columns:
-            unit = split_unit(name)[1]
-            if unit and names_time(split_unit(name)[0]) and not unit_of(unit):
-                reason = f"{unit} is no unit of time, so that it has no times of rows"
-                self.ledger.add("column", "kept", reason, name=name)
-        for name, unit in self.times.items():
-            clocks = [r.clocks[name] for r in self.recordings if name in r.clocks]
-            if unit not in {"date", "s", "ms", unit_in(name)}:
-                reason = f"its numbers are taken for {UNIT_NAMES[unit]} by their size"
-                self.ledger.add("column", "kept", reason, name=name)
-            if any(len(clock.by_order) > 1 for clock in clocks):
-                self.ledger.add("column", "kept", f"dates with the {self.date_order}", name=name)
+        self.columns = {new.get(name, name): facts for name, facts in self.columns.items()}
+        for recording in self.recordings if new else ():
+            recording.rename(new)
 
     def add(self, recording: Recording, file: str) -> None:
         """Read the rows of a recording in blocks and keep what is in them."""
-        if not any(topic.rows for topic in recording.topics.values()):
+        topics = recording.topics.items()
+        if not any(topic.rows for _, topic in topics):
             self._rowless.append((file, recording.name))
             return
         folder = self.path if self.path.name != file else self.path.parent
         source = recording.source.removeprefix(f"{folder}/")
-        columns: list[str] = []
-        clocks: dict[str, ClockFacts] = {}
-        added: dict[str, str] = {}
-        values: dict[str, Counter[float | str]] = {}
-        empty: set[str] = set()
-        rows, topics = _RowHashes(), recording.topics.items()
-        is_short = len(topics) == 1 and max(topic.rows for _, topic in topics) <= _SHORT
+        facts = RecordingFacts(
+            recording.name,
+            file,
+            {name: topic.rows for name, topic in topics},
+            dict(recording.fields),
+            frozenset(f"{n}.{t.time}" if n else t.time for n, t in topics if t.time),
+        )
+        is_short = len(topics) == 1 and facts.length <= _SHORT
         if not is_short:
             self._work_off()
         for topic_name, topic in topics:
-            below = f"{topic_name}." if topic_name else ""
-            names = self._names(topic, below, file)
-            columns += names.values()
-            facts = {n: self.columns.setdefault(name, ColumnFacts()) for n, name in names.items()}
+            names = self._names(topic, f"{topic_name}." if topic_name else "", file)
+            facts.columns += tuple(names.values())
+            for name in names.values():
+                self.columns.setdefault(name, ColumnFacts())
             likely: list[tuple[str, ...]] = []
             stamps: dict[str, list[Column]] = {}
-            numbered: list[NDArray[np.int64]] = [np.zeros(0, np.int64)]
+            numbered: list[NDArray[np.int64]] = []
             for start, block in _blocks(topic):
                 if not start:
                     likely = _time_columns(topic, block)
-                    stamps = {name: [] for names_ in likely for name in names_}
-                    rows.begin(block, stamps)
-                rows.add(block)
-                if is_short:
-                    waiting = {names[name]: cells for name, cells in block.items()}
-                    self._pending.append((source, waiting, values, empty))
-                for name, cells in {} if is_short else block.items():
-                    if not start:
-                        facts[name].begin([source])
-                    elif start != numbered[-1][-1] + 1:
-                        facts[name].leap()
-                    facts[name].add(cells, start)
+                    stamps = {name: [] for together in likely for name in together}
+                    numbers = (n for n, x in block.items() if x.dtype.kind == "f")
+                    varied = (n for n in numbers if len({*block[n][:1000].tolist()}) > FEW)
+                    hashed = sorted({*varied} - {*stamps})
+                facts.hash_rows(block, hashed)
+                waiting = {names[name]: cells for name, cells in block.items()}
+                self._pending.append((source, start, waiting, facts))
+                if not is_short:
+                    self._work_off()
                 numbered.append(np.arange(start, start + len(next(iter(block.values())))))
                 for name in stamps:
                     stamps[name].append(block[name])
@@ -507,63 +481,33 @@ class Inspection:
                 cells_of = [np.concatenate(stamps[name]) for name in (first, *more)]
                 with contextlib.suppress(TrajectoryError):
                     if clock := ClockFacts.of(np.concatenate(numbered), cells_of):
-                        clocks[names[first]] = clock
-                        added.update((names[first], names[name]) for name in more)
-            if not is_short and topic.rows:
-                self._keep(names.values(), [(values, empty)])
+                        facts.clocks[names[first]] = clock
+                        facts.added.update((names[first], names[name]) for name in more)
         self.ledger.merge(recording.ledger, source)
-        self.recordings.append(
-            RecordingFacts(
-                recording.name,
-                recording.source,
-                file,
-                {name: topic.rows for name, topic in topics},
-                tuple(columns),
-                clocks,
-                frozenset(f"{n}.{t.time}" if n else t.time for n, t in topics if t.time),
-                added,
-                values,
-                dict(recording.fields),
-                empty,
-                rows.digest.hexdigest(),
-                rows.head,
-                rows.tail,
-            )
-        )
+        self.recordings.append(facts)
         if len(self._pending) >= _PENDING:
             self._work_off()
 
     def _work_off(self) -> None:
-        """Count the cells of short recordings that have waited, column by column."""
+        """Count the cells of blocks that have waited, column by column."""
         pending, self._pending = self._pending, []
-        for _, alike in itertools.groupby(pending, key=lambda waiting: [*waiting[1]]):
-            recordings = [*alike]
-            for name in recordings[0][1]:
+        for _, alike in itertools.groupby(pending, key=lambda waiting: [*waiting[2]]):
+            blocks = [*alike]
+            for name in blocks[0][2]:
                 # A text in one makes no texts of the others' numbers.
-                texts = [r for r in recordings if r[1][name].dtype.kind == "U"]
-                numbers = [r for r in recordings if r[1][name].dtype.kind != "U"]
+                texts = [block for block in blocks if block[2][name].dtype.kind == "U"]
+                numbers = [block for block in blocks if block[2][name].dtype.kind != "U"]
                 for several in filter(None, (texts, numbers)):
-                    cells = [recording[1][name] for recording in several]
-                    firsts = np.cumsum([0, *map(len, cells[:-1])])
-                    self.columns[name].begin([recording[0] for recording in several], firsts)
-                    self.columns[name].add(np.concatenate(cells))
-                    self._keep([name], [recording[2:] for recording in several])
-
-    def _keep(
-        self,
-        names: Iterable[str],
-        recordings: Sequence[tuple[dict[str, Counter[float | str]], set[str]]],
-    ) -> None:
-        """Keep the values of columns in each of the last recordings, and which it lacks."""
-        for name in names:
-            facts = self.columns[name]
-            for (values, empty), recent, filled in zip(
-                recordings, facts.recent, facts.filled.tolist(), strict=True
-            ):
-                if facts.values is not None:
-                    values[name] = recent
-                if not filled:
-                    empty.add(name)
+                    cells = [block[2][name] for block in several]
+                    start, column = several[0][1], self.columns[name]
+                    if not start:
+                        firsts = np.cumsum([0, *map(len, cells[:-1])])
+                        column.begin([source for source, *_ in several], firsts)
+                    column.add(np.concatenate(cells), start)
+                    for i, (*_, facts) in enumerate(several):
+                        if column.values is not None:
+                            facts.values[name] = column.recent[i]
+                        (facts.empty.discard if column.filled[i] else facts.empty.add)(name)
 
 
 def inspect_logs(
@@ -619,16 +563,16 @@ def inspect_logs(
                     result.episode = episode_columns(recording)
                     if result.episode and (result.recordings or later):
                         return inspect_logs(path, form, options, progress, result.episode)
-                if result.episode:
-                    for part in split_recording(recording, result.episode, lenient=True):
-                        result.add(part, names[file])
-                    continue
                 columns = [n for topic in recording.topics.values() for n in topic.names]
+                if any(expected <= {*columns} for expected in _INTERVALS):
+                    result.intervals = names[file]
+                    continue
                 # Those of a matrix, or of a text without a header, are numbered.
                 stems = {re.sub(r"\d+(\[.*\])?$", "", name) for name in columns}
                 is_matrix = len(recording.topics) == len(stems) == 1 < len(columns)
-                if any(expected <= {*columns} for expected in _INTERVALS):
-                    result.intervals = names[file]
+                if result.episode:
+                    for part in split_recording(recording, result.episode, lenient=True):
+                        result.add(part, names[file])
                 elif is_matrix and "transpose" in reader.options:
                     later.append((file, recording))
                 else:
@@ -653,7 +597,7 @@ def inspect_logs(
     result.recordings.sort(key=lambda recording: order[recording.file])
     result.equal = _equal(result.recordings)
     equal = {file for same in result.equal for file in same}
-    by_digest: dict[str, set[str]] = defaultdict(set)
+    by_digest: dict[bytes, set[str]] = defaultdict(set)
     for facts in result.recordings:
         by_digest[facts.digest].add(facts.file)
     shared = Counter(r.file for r in result.recordings if len(by_digest[r.digest]) > 1)
@@ -693,8 +637,8 @@ def recognised(path: Path, form: str) -> tuple[Reader, list[Path], Counter[str]]
         )
     # Beside logs, JSON files hold settings.
     name = max(by_reader, key=lambda reader: (reader != "json", len(by_reader[reader])))
-    left_out = {*files} - {*by_reader[name]}
-    return formats[name], by_reader[name], Counter(file.suffix for file in left_out)
+    read = {*by_reader[name]}
+    return formats[name], by_reader[name], Counter(f.suffix for f in files if f not in read)
 
 
 def refuse_logs(outputs: Iterable[Path | None], logs: Path, form: str | None) -> None:
@@ -738,15 +682,15 @@ def _continued(recordings: Sequence[RecordingFacts]) -> list[tuple[str, str, int
 
 def _equal(recordings: Sequence[RecordingFacts]) -> list[list[str]]:
     """Return the files that have the same rows as others, and the recordings of one file."""
-    digests: dict[str, list[str]] = defaultdict(list)
+    digests: dict[str, list[bytes]] = defaultdict(list)
     for recording in recordings:
         digests[recording.file].append(recording.digest)
-    groups: dict[tuple[str, ...], list[str]] = defaultdict(list)
+    groups: dict[tuple[bytes, ...], list[str]] = defaultdict(list)
     for file, rows in digests.items():
         groups[tuple(rows)].append(file)
     if len(digests) == 1:
         for recording in recordings:
-            groups[recording.digest, ""].append(recording.name)
+            groups[recording.digest, b""].append(recording.name)
     return [same for same in groups.values() if len(same) > 1]
 
 
