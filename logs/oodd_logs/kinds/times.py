@@ -12,46 +12,31 @@ from numpy.typing import NDArray
 from oodd_eval.errors import TrajectoryError, UnknownNameError
 from oodd_logs.recording import MISSING, Column
 
-_PER_SECOND: Final = {"ns": 10**9, "us": 10**6, "ms": 10**3, "s": 1}
-_SECONDS_IN: Final = {"min": 60, "h": 3600, "d": 86400}
-
-SCALES: Final = {u: 1 / n for u, n in _PER_SECOND.items()} | _SECONDS_IN | {"date": 1.0}
+_UNITS: Final = (
+    ("ns", 1e-9, "nanoseconds nsec nsecs nanos nanosec nanosecs nanosecond"),
+    ("us", 1e-6, "microseconds µs μs usec usecs micros microsec microsecs microsecond"),
+    ("ms", 1e-3, "milliseconds msec msecs millis millisec millisecs millisecond"),
+    ("s", 1.0, "seconds sec secs second sekunden"),
+    ("min", 60.0, "minutes mins minute minuten"),
+    ("h", 3600.0, "hours hr hrs hour stunden"),
+    ("d", 86400.0, "days day tage"),
+)
+SCALES: Final = {"date": 1.0, **{unit: scale for unit, scale, _ in _UNITS}}
 """Seconds in the units of stamps; dates, and times as texts, are read as seconds."""
 
-UNIT_NAMES: Final = {
-    "date": "dates",
-    "s": "seconds",
-    "ms": "milliseconds",
-    "us": "microseconds",
-    "ns": "nanoseconds",
-    "min": "minutes",
-    "h": "hours",
-    "d": "days",
-}
+UNIT_NAMES: Final = {"date": "dates", **{unit: words.split()[0] for unit, _, words in _UNITS}}
 """Words for the units of stamps."""
 
-_SPELLINGS: Final = {
-    "ns": "ns nsec nsecs nanos nanosec nanosecs nanosecond nanoseconds",
-    "us": "us µs μs usec usecs micros microsec microsecs microsecond microseconds",
-    "ms": "ms msec msecs millis millisec millisecs millisecond milliseconds",
-    "s": "s sec secs second seconds sekunden",
-    "min": "min mins minute minutes minuten",
-    "h": "h hr hrs hour hours stunden",
-    "d": "d day days tage",
-}
-_UNIT_OF: Final = {word: unit for unit, words in _SPELLINGS.items() for word in words.split()}
-_TIME_WORDS: Final = frozenset(
-    ("time", "timestamp", "datetime", "date", "stamp", "ts", "t", "elapsed", "uptime", "epoch",
-     "zeit", "zeitstempel", "datum", "uhrzeit")
-)  # fmt: skip
+_UNIT_OF: Final = {word: unit for unit, _, words in _UNITS for word in (unit, *words.split())}
+_TIME_WORD: Final = re.compile(
+    "(?:date)?time|(?:time)?stamp|ts?|date|elapsed|uptime|epoch|zeit(?:stempel)?|datum|uhrzeit"
+)
 _WORD: Final = re.compile(r"[A-Zµμ]?[a-zµμ]+|[A-Zµμ]+")
-_MONTHS: Final = (
-    "jan", "feb", "mar mär mrz", "apr", "may mai", "jun", "jul", "aug", "sep", "oct okt", "nov",
-    "dec dez",
-)  # fmt: skip
-_MONTH_OF: Final = {name: i for i, names in enumerate(_MONTHS, 1) for name in names.split()}
+_MONTHS: Final = re.compile(
+    "(jan)|(feb)|(m[aä]r|mrz)|(apr)|(ma[iy])|(jun)|(jul)|(aug)|(sep)|(o[ck]t)|(nov)|(de[cz])",
+    re.IGNORECASE,
+)
 _DAY: Final = 86400.0
-_EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 _TEXT: Final = re.compile(
     r"(?:(?:(?P<first>\d{1,4})[-/. ](?P<second>\d{1,2}|[^\W\d]{3,9})[-/. ]+(?P<third>\d{2,4})"
     r"|(?P<name>[^\W\d]{3,9})[. ]+(?P<day>\d{1,2})[. ]+(?P<year>\d{4})|(?P<days>-?\d+) ?days?)"
@@ -102,7 +87,8 @@ def names_time(name: str) -> bool:
     if len(name.strip()) > 1 and unit_of(name):  # a column called seconds
         return True
     words = re.findall(r"[^\W\d_]+", name.lower())
-    return not _TIME_WORDS.isdisjoint([*words, *(w for w in words_of(name) if len(w) > 1)])
+    words += [word for word in words_of(name) if len(word) > 1]
+    return any(map(_TIME_WORD.fullmatch, words))
 
 
 def pairs_of(names: Sequence[str]) -> dict[str, str]:
@@ -153,36 +139,34 @@ def parse_times(column: Column, unit: str = "", order: str = "") -> NDArray[np.f
     """
     known = unit_of(unit) or {"iso": "iso", "": "s", "1": "s"}.get(unit, "")
     if not known:
-        raise UnknownNameError("unit of time", unit, [*_PER_SECOND, *_SECONDS_IN, "iso"])
+        raise UnknownNameError("unit of time", unit, [unit for unit, *_ in _UNITS] + ["iso"])
     if column.dtype.kind != "U":
         if known == "iso":
             raise TrajectoryError("times are numbers, expected dates, or a unit such as s or ms")
-        times = np.asarray(column, np.float64)
-        return times * _SECONDS_IN[known] if known in _SECONDS_IN else times / _PER_SECOND[known]
+        times, scale = np.asarray(column, np.float64), SCALES[known]
+        # Divided by a whole number, decimal fractions of a second are the nearest numbers.
+        return times * scale if scale >= 1 else times / round(1 / scale)
     if unit not in {"", "iso"}:
         raise TrajectoryError(f"times are texts such as {column[:1].tolist()}, expected numbers")
-    if not len(column):
-        return np.empty(0)
-    cells = np.strings.replace(np.strings.strip(column), ",", ".")
-    missing = np.isin(np.strings.lower(cells), [*MISSING])
-    # NumPy takes "now" and a single number, too.
-    dated = np.strings.isdigit(cells.astype("U4")) & (np.strings.str_len(cells) >= 8)
-    plain = np.strings.rstrip(np.where(missing, "NaT", cells), "Zz")
-    # A sign behind the day is that of an offset; hyphens before it belong to the date.
-    signs = np.maximum(np.strings.rfind(plain, "+"), np.strings.rfind(plain, "-"))
-    zoned, offsets, heads = np.flatnonzero(signs > 9).tolist(), np.zeros(len(plain)), plain.tolist()
-    tails = [heads[row][signs[row] :] for row in zoned]
-    for row in zoned:
-        heads[row] = heads[row][: signs[row]]
-    try:
-        shifts = {tail: _offset(tail) for tail in {*tails}}
-        offsets[zoned] = [shifts[tail] for tail in tails]
-        stamps = (np.array(heads) if tails else plain).astype("M8[ns]")
-    except ValueError:
-        return _one_by_one(cells.tolist(), missing, order)
-    if not (dated | missing).all():
-        return _one_by_one(cells.tolist(), missing, order)
-    return np.where(missing, np.nan, stamps.astype(np.int64) / 1e9 - offsets)
+    orders: Sequence[str] = [order] if order else []
+    times = np.full(len(column), np.nan)
+    for row, text in enumerate(column.tolist()):
+        cell = text.strip().replace(",", ".")
+        if cell.lower() in MISSING:
+            continue
+        try:
+            stamp = datetime.fromisoformat(cell)
+        except ValueError:
+            orders = orders or orders_of(column) or ["day first"]
+            if len(orders) > 1:
+                raise TrajectoryError(
+                    f"row {row}: day or month may be first in {cell!r:.80}, expected dates = "
+                    '"day first" or dates = "month first" in the recipe'
+                ) from None
+            times[row] = _parsed(cell, row, orders[0])
+        else:
+            times[row] = (stamp if stamp.tzinfo else stamp.replace(tzinfo=UTC)).timestamp()
+    return times
 
 
 def past_midnight(times: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -221,35 +205,8 @@ def orders_of(*columns: Column) -> tuple[str, ...]:
     return tuple(orders[::-1] if halves else orders)
 
 
-def _offset(text: str) -> float:
-    zone = datetime.fromisoformat(f"2000-01-01T00:00:00{text}").utcoffset()
-    return 0.0 if zone is None else zone.total_seconds()
-
-
-def _one_by_one(
-    cells: Sequence[str], missing: NDArray[np.bool_], order: str
-) -> NDArray[np.float64]:
-    """Return times that NumPy cannot read, such as 20180718T195650Z and 14/03/2025 11:58."""
-    times, orders = np.full(len(cells), np.nan), [order] if order else None
-    for row in np.flatnonzero(~missing).tolist():
-        try:
-            stamp = datetime.fromisoformat(cells[row])
-        except ValueError:
-            if orders is None:
-                orders = [*orders_of(np.array(cells))]
-                if len(orders) > 1:
-                    raise TrajectoryError(
-                        f"row {row}: day or month may be first in {cells[row]!r:.80}, expected "
-                        'dates = "day first" or dates = "month first" in the recipe'
-                    ) from None
-            times[row] = _parsed(cells[row], row, *orders)
-            continue
-        zoned = stamp if stamp.tzinfo else stamp.replace(tzinfo=UTC)
-        times[row] = (zoned - _EPOCH).total_seconds()
-    return times
-
-
-def _parsed(cell: str, row: int, order: str = "day first") -> float:
+def _parsed(cell: str, row: int, order: str) -> float:
+    """Return a time that is in no form of ISO 8601, such as 14/03/2025 11:58."""
     match = _TEXT.fullmatch(cell)
     problem = TrajectoryError(
         f"row {row}: {cell!r:.80} is no time, expected a date such as 2024-05-01T12:00:00.5Z, a "
@@ -259,28 +216,30 @@ def _parsed(cell: str, row: int, order: str = "day first") -> float:
         raise problem
     if match["plain"]:
         return float(match["plain"])
-    seconds = float(match["days"] or 0) * 86400
     try:
+        seconds = 86400.0 * int(match["days"] or 0)
         if match["first"] or match["name"]:
             seconds += 86400 * (_date(match, order) - date(1970, 1, 1)).days
         if match["hours"]:
             seconds += _time_of_day(match)
-        if zone := match["zone"]:
-            seconds -= _offset(zone) if zone[0] in "+-" else 0.0
-    except (KeyError, ValueError):
+        if (zone := match["zone"]) and zone[0] in "+-":
+            seconds -= int(f"{zone[0]}1") * (3600 * int(zone[1:3]) + 60 * int(zone[-2:]))
+    except ValueError:
         raise problem from None
     return seconds
 
 
 def _date(match: re.Match[str], order: str) -> date:
-    if match["name"]:
-        return date(int(match["year"]), _MONTH_OF[match["name"][:3].lower()], int(match["day"]))
     first, second, third = match["first"], match["second"], match["third"]
-    if len(first) > 2:  # 2025/03/04
+    if match["name"]:
+        first, second, third = match["day"], match["name"], match["year"]
+    elif len(first) > 2:  # 2025/03/04
         first, third = third, first
     elif second.isdigit() and order == "month first":
         first, second = second, first
-    month = int(second) if second.isdigit() else _MONTH_OF[second[:3].lower()]
+    month = int(second) if second.isdigit() else 0
+    if named := _MONTHS.match(second):
+        month = named.lastindex or 0
     return date(int(third) + 2000 * (len(third) == 2), month, int(first))
 
 
