@@ -165,8 +165,8 @@ class ColumnFacts:
         ):
             row, key = int(rows[first]), (reason, self.sources[i])
             fresh = 0, start + row - int(self.firsts[i]), f"{values[row]!s:.60}"
-            before, *first_cell = self.exceptions.get(key, fresh)
-            self.exceptions[key] = (before + int(count), *first_cell)
+            before, first_row, cell = self.exceptions.get(key, fresh)
+            self.exceptions[key] = before + int(count), first_row, cell
 
     def _count_codes(self, numbers: NDArray[np.float64], present: NDArray[np.bool_]) -> None:
         """Count cells that may stand for a missing value, and keep where most others are."""

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,6 +57,7 @@ _LABEL: Final = re.compile(
     re.IGNORECASE,
 )
 _DAY: Final = 86400  # seconds
+_Key, _Value = TypeVar("_Key"), TypeVar("_Value")
 _INTERVALS: Final = ({"file", "start"}, {"file", "onset"})
 
 
@@ -223,14 +224,15 @@ class Inspection:
 
         They are likely where half of the recordings with their topic have them.
         """
-        shares: dict[str, list[tuple[float, float]]] = defaultdict(list)
         topics = Counter(topic for recording in self.recordings for topic in recording.rows)
-        for recording in self.recordings:
-            for name, clock in recording.clocks.items():
-                rows = max(1, recording.rows[self.topic_of(name)])
-                shares[name].append((clock.steps.falls / rows, clock.steps.repeats / rows))
-        most = {name: 2 * len(s) >= topics[self.topic_of(name)] for name, s in shares.items()}
-        return {name: tuple(np.median(shares[name], axis=0)) for name in shares if most[name]}
+        shares = grouped(
+            (name, np.array([clock.steps.falls, clock.steps.repeats]) / max(1, rows))
+            for recording in self.recordings
+            for name, clock in recording.clocks.items()
+            for rows in [recording.rows[self.topic_of(name)]]
+        )
+        likely = (name for name in shares if 2 * len(shares[name]) >= topics[self.topic_of(name)])
+        return {name: tuple(np.median(shares[name], axis=0)) for name in likely}
 
     @cached_property
     def standing(self) -> set[str]:
@@ -304,7 +306,8 @@ class Inspection:
         """Roles of columns regardless of the files that they are in."""
         names_by_role = {"times": {*self.times, *self.added.values()}, "labels": {*self.labels}}
         names_by_role |= {"standing": self.standing}
-        of_kinds, together = {}, set()
+        of_kinds: dict[str, str] = {}
+        together: set[str] = set()
         for kind, found in self.kinds.items():
             for names in found:
                 of_kinds |= dict.fromkeys(names, "" if kinds()[kind].sensor else kind)
@@ -340,12 +343,10 @@ class Inspection:
         """
         copies = {file for same in self.equal for file in same[1:]}
         files = dict.fromkeys(r.file for r in self.recordings if r.file not in copies)
-        without: dict[str, set[str]] = defaultdict(set)
-        for recording in (r for r in self.recordings if r.file in files):
-            for name in self._lacking(recording):
-                without[name].add(recording.file)
+        recordings = (r for r in self.recordings if r.file in files)
+        without = grouped((name, r.file) for r in recordings for name in self._lacking(r))
         left_out: set[str] = set()
-        for lacking in sorted(without.values(), key=len):
+        for lacking in sorted(map(set, without.values()), key=len):
             if len(left_out | lacking) <= _FEW_FILES * len(files):
                 left_out |= lacking
         usable = [r for r in self.recordings if r.file in files and r.file not in left_out]
@@ -597,10 +598,8 @@ def inspect_logs(
     result.recordings.sort(key=lambda recording: order[recording.file])
     result.equal = _equal(result.recordings)
     equal = {file for same in result.equal for file in same}
-    by_digest: dict[bytes, set[str]] = defaultdict(set)
-    for facts in result.recordings:
-        by_digest[facts.digest].add(facts.file)
-    shared = Counter(r.file for r in result.recordings if len(by_digest[r.digest]) > 1)
+    with_rows = grouped((facts.digest, facts.file) for facts in result.recordings)
+    shared = Counter(r.file for r in result.recordings if len({*with_rows[r.digest]}) > 1)
     result.shared = {file: n for file, n in shared.items() if file not in equal}
     result.continued = _continued(result.recordings)
     result.settle([*order])
@@ -624,11 +623,9 @@ def recognised(path: Path, form: str) -> tuple[Reader, list[Path], Counter[str]]
     if not path.is_file():
         visible = (f for f in path.rglob("*") if "/." not in f"/{f.relative_to(path).as_posix()}")
         files = sorted(filter(Path.is_file, visible), key=lambda file: in_order(str(file)))
-    by_reader: dict[str, list[Path]] = defaultdict(list)
-    for file in files:
-        best = max(formats.values(), key=lambda reader: reader.fits(file))
-        if best.fits(file) or (form and path.is_file()):
-            by_reader[best.name].append(file)
+    best = ((max(formats.values(), key=lambda reader: reader.fits(file)), file) for file in files)
+    is_said = bool(form) and path.is_file()
+    by_reader = grouped((r.name, file) for r, file in best if is_said or r.fits(file))
     if not by_reader:
         endings = ", ".join(sorted({s for reader in formats.values() for s in reader.suffixes}))
         raise UsageError(
@@ -661,36 +658,37 @@ def refuse_logs(outputs: Iterable[Path | None], logs: Path, form: str | None) ->
             )
 
 
+def grouped(pairs: Iterable[tuple[_Key, _Value]]) -> dict[_Key, list[_Value]]:
+    """Return the second items of pairs by the first."""
+    groups: dict[_Key, list[_Value]] = defaultdict(list)
+    for key, value in pairs:
+        groups[key].append(value)
+    return groups
+
+
 def _continued(recordings: Sequence[RecordingFacts]) -> list[tuple[str, str, int]]:
     """Return files of which the last rows of the first are the first of the second."""
-    beginning: dict[int, list[RecordingFacts]] = defaultdict(list)
-    for recording in recordings:
-        if len({*recording.head[:_OVERLAP].tolist()}) == _OVERLAP:
-            beginning[int(recording.head[0])].append(recording)
+    varied = (r for r in recordings if len({*r.head[:_OVERLAP].tolist()}) == _OVERLAP)
+    beginning = grouped((int(recording.head[0]), recording) for recording in varied)
     first_rows = np.array([*beginning], np.uint64)
-    continuations = []
-    for recording in recordings:
-        tail = recording.tail
-        for i in np.flatnonzero(np.isin(tail, first_rows)).tolist():
-            n = len(tail) - i
-            for other in beginning[int(tail[i])]:
-                is_whole = n == recording.length == other.length
-                if n >= _OVERLAP and not is_whole and np.array_equal(tail[i:], other.head[:n]):
-                    continuations.append((recording.file, other.file, n))
-    return continuations
+    return [
+        (recording.file, other.file, len(rows))
+        for recording in recordings
+        for i in np.flatnonzero(np.isin(recording.tail, first_rows)).tolist()
+        for rows in [recording.tail[i:]]
+        for other in beginning[int(rows[0])]
+        if len(rows) >= _OVERLAP
+        and not len(rows) == recording.length == other.length
+        and np.array_equal(rows, other.head[: len(rows)])
+    ]
 
 
 def _equal(recordings: Sequence[RecordingFacts]) -> list[list[str]]:
     """Return the files that have the same rows as others, and the recordings of one file."""
-    digests: dict[str, list[bytes]] = defaultdict(list)
-    for recording in recordings:
-        digests[recording.file].append(recording.digest)
-    groups: dict[tuple[bytes, ...], list[str]] = defaultdict(list)
-    for file, rows in digests.items():
-        groups[tuple(rows)].append(file)
+    digests = grouped((recording.file, recording.digest) for recording in recordings)
+    groups = grouped((tuple(rows), file) for file, rows in digests.items())
     if len(digests) == 1:
-        for recording in recordings:
-            groups[recording.digest, b""].append(recording.name)
+        groups = grouped(((recording.digest,), recording.name) for recording in recordings)
     return [same for same in groups.values() if len(same) > 1]
 
 

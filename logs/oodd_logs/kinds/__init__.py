@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from oodd_eval.data.facts import NAME_PATTERN, Quantity
 from oodd_eval.errors import PluginError
-from oodd_logs.recording import Column
 
 Matrix = NDArray[np.float64]
 
@@ -141,9 +140,8 @@ def read_texts(texts: Sequence[str]) -> dict[str, float]:
 
 @functools.cache
 def _ours() -> dict[str, Kind]:
-    modules = [
-        importlib.import_module(m.name) for m in pkgutil.iter_modules(__path__, f"{__name__}.")
-    ]
+    names = (module.name for module in pkgutil.iter_modules(__path__, f"{__name__}."))
+    modules = map(importlib.import_module, names)
     return {module.KIND.name: module.KIND for module in modules if hasattr(module, "KIND")}
 
 
@@ -153,15 +151,3 @@ def _of_messages() -> list[tuple[Kind, Callable[[str, Any], Iterable[tuple[str, 
 
 
 _registered: Final[dict[str, Kind]] = {}
-
-__all__ = [
-    "Column",
-    "Conversion",
-    "Kind",
-    "check_kind",
-    "flattened",
-    "kinds",
-    "kinds_by_key",
-    "read_texts",
-    "register_kinds",
-]

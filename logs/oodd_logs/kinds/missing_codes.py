@@ -7,8 +7,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from oodd_eval.errors import UsageError
 from oodd_logs.kinds import Kind
+from oodd_logs.kinds.naming import wrong_value
 
 KEY: Final = "missing_codes"
 
@@ -45,8 +45,7 @@ def check(key: str, value: Any) -> dict[str, tuple[float | str, ...]]:
     if isinstance(value, int | float | str) or any(
         type(code) not in {int, float, str} for listed in codes.values() for code in listed
     ):
-        expected = "a list of numbers and texts, or a table of such by column"
-        raise UsageError(f"{key} is {value!r:.80}, expected {expected}")
+        raise wrong_value(key, value, "a list of numbers and texts, or a table of such by column")
     return codes
 
 

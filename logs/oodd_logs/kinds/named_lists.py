@@ -21,7 +21,7 @@ Pairs = Iterable[tuple[str, Any]]
 def _flatten(name: str, value: Any) -> Pairs | None:
     if isinstance(value, Mapping):
         return _beside_names(name, value)
-    if _is_list(value) and len(value) and isinstance(value[0], Mapping):
+    if _is_list(value) and len(value) and all(isinstance(item, Mapping) for item in value):
         return _with_names(name, value)
     return None
 
@@ -64,8 +64,6 @@ def _named(value: Any, names: Sequence[str]) -> Any:
 
 def _with_names(name: str, value: Sequence[Any]) -> Pairs | None:
     """Return objects by their names, and values of pairs of a key and a value by the key."""
-    if not all(isinstance(item, Mapping) for item in value):
-        return None
     for key in _NAMES:
         names = [item.get(key) for item in value]
         if _are_names(names):
@@ -88,11 +86,9 @@ def _are_names(value: Any) -> bool:
 
 def _labels(names: Sequence[str]) -> list[str]:
     """Return names as parts of those of columns, in which brackets are around units, at the end."""
-    labels = []
-    for text in names:
-        head, unit = re.fullmatch(r"(.*?)(\[[^\[\]]+\])?", text, re.DOTALL).groups("")  # type: ignore[union-attr]
-        labels.append(head.replace("[", "(").replace("]", ")").strip() + unit)
-    return labels
+    parts = [re.split(r"(\[[^\[\]]+\])\Z", text) for text in names]
+    brackets = str.maketrans("[]", "()")
+    return [head.translate(brackets).strip() + "".join(unit) for head, *unit in parts]
 
 
 KIND: Final = Kind("named-lists", "", flatten=_flatten)

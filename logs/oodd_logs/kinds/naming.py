@@ -37,14 +37,14 @@ def matching(globs: Iterable[str], sensors: Sequence[Quantity], noun: str) -> li
     UnknownNameError
         When a glob matches none; `noun` says what it should be.
     """
-    names, found = [sensor.name for sensor in sensors], set()
+    names, positions = [sensor.name for sensor in sensors], set()
     for glob in globs:
-        pattern = pattern_of(glob.strip())
-        positions = [i for i, name in enumerate(names) if pattern.fullmatch(name)]
-        if not positions:
+        matches = map(pattern_of(glob.strip()).fullmatch, names)
+        matched = {i for i, match in enumerate(matches) if match}
+        if not matched:
             raise UnknownNameError(noun, glob, names)
-        found |= {*positions}
-    return sorted(found)
+        positions |= matched
+    return sorted(positions)
 
 
 def pattern_of(pattern: str) -> re.Pattern[str]:

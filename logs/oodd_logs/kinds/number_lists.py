@@ -1,5 +1,6 @@
 """Lists of numbers: long ones, and covariances, become a few figures."""
 
+import contextlib
 from collections.abc import Iterable
 from typing import Any, Final
 
@@ -46,31 +47,26 @@ def is_folded(name: str, size: int) -> bool:
 
 
 def _flatten(name: str, value: Any) -> Iterable[tuple[str, Any]] | None:
-    if not isinstance(value, list | tuple | np.ndarray) or not is_folded(name, np.size(value)):
-        return None
-    if (numbers := as_numbers(value)) is None:
+    is_list = isinstance(value, list | tuple | np.ndarray) and is_folded(name, np.size(value))
+    if not is_list or (numbers := as_numbers(value)) is None:
         return None
     return [(label, float(x[0])) for label, x in figures(name, numbers[None]).items()]
 
 
 def as_numbers(value: Any) -> NDArray[np.float64] | None:
     """Return nested lists as an array; None where they hold other things, or are ragged."""
-    array = value
-    if not isinstance(value, np.ndarray):
-        head = value
-        while isinstance(head, list | tuple) and head:
-            head = head[0]
-        if not (head is None or isinstance(head, int | float | np.number)):
-            return None
-        try:
-            array = np.array(value)
-        except ValueError:
-            return None
-    if array.dtype.kind not in "fiub":
-        items = array.ravel().tolist() if array.dtype.kind == "O" else [""]
-        if not all(x is None or isinstance(x, int | float) for x in items):
-            return None
-    return np.asarray(array, np.float64)
+    head = value
+    while isinstance(head, list | tuple) and head:
+        head = head[0]
+    if isinstance(head, int | float | np.number | np.ndarray | None):
+        with contextlib.suppress(ValueError):
+            array = np.asarray(value)
+            items = array.ravel().tolist() if array.dtype.kind == "O" else []
+            if array.dtype.kind in "fiubO" and all(
+                isinstance(x, int | float | None) for x in items
+            ):
+                return np.asarray(array, np.float64)
+    return None
 
 
 KIND: Final = Kind(

@@ -24,16 +24,16 @@ def _recognise(columns: Mapping[str, Any]) -> dict[str | tuple[str, ...], Any]:
     for name in columns:
         if match := _LETTER.fullmatch(re.sub(r"\[[^\]\d]*\]$", "", name)):
             by_stem.setdefault(match["stem"], []).append(name)
-    named = [(tuple(names), _NAMED) for names in by_stem.values() if len(names) == 4]
+    fours = [(tuple(names), _NAMED) for names in by_stem.values() if len(names) == 4]
     names = [*columns]
-    neighbours = [(tuple(names[i : i + 4]), _UNNAMED) for i in range(len(names) - 3)]
+    fours += [(tuple(names[i : i + 4]), _UNNAMED) for i in range(len(names) - 3)]
     taken: set[str] = set()
-    found: dict[str | tuple[str, ...], Any] = {}
-    for four, tolerance in (*named, *neighbours):
+    rotations: dict[str | tuple[str, ...], Any] = {}
+    for four, tolerance in fours:
         if not taken & {*four} and _is_rotation([columns[name] for name in four], tolerance):
-            found[four] = None
+            rotations[four] = None
             taken |= {*four}
-    return found
+    return rotations
 
 
 def _is_rotation(facts: Sequence[Any], tolerance: float) -> bool:
@@ -72,14 +72,11 @@ class _Signs:
                 return rows
             turns = np.sign((known[1:] * known[:-1]).sum(axis=1))
             signs = np.cumprod(np.append(1.0, np.where(turns < 0, -1.0, 1.0)))
-            if last.any():
-                signs *= -1.0 if last @ known[0] < 0 else 1.0
-            else:
-                mean = (known * signs[:, None]).sum(axis=0)
-                if not self._reference.any():
-                    largest = mean[np.abs(mean).argmax()]
-                    self._reference = mean * (-1.0 if largest < 0 else 1.0)
-                signs *= -1.0 if mean @ self._reference < 0 else 1.0
+            mean = (known * signs[:, None]).sum(axis=0)
+            if not self._reference.any():
+                self._reference = mean * np.copysign(1.0, mean[np.abs(mean).argmax()])
+            before, first = (last, known[0]) if last.any() else (self._reference, mean)
+            signs *= np.copysign(1.0, before @ first)
             last = known[-1] * signs[-1]
             out = rows.copy()
             out[present] = known * signs[:, None]

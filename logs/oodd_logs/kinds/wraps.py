@@ -5,19 +5,17 @@ from typing import Any, Final
 
 import numpy as np
 
-from oodd_eval.data.facts import Quantity, Role
+from oodd_eval.data.facts import Quantity
 from oodd_logs.kinds import Conversion, Kind, Matrix
 from oodd_logs.kinds.naming import matching, wrong_value
 
 
 def sine_and_cosine(position: int, sensor: Quantity, period: float) -> Conversion:
     """Return what makes sine and cosine of a sensor that begins anew after a period."""
-    roles: tuple[Role, Role] = (sensor.role, sensor.role)
-    if sensor.role == "angle":
-        roles = "sine", "cosine"
+    sine, cosine = ("sine", "cosine") if sensor.role == "angle" else (sensor.role, sensor.role)
     outputs = tuple(
         Quantity(f"{function} {sensor.name}", "1", role)
-        for function, role in zip(("sin", "cos"), roles, strict=True)
+        for function, role in (("sin", sine), ("cos", cosine))
     )
 
     def convert(rows: Matrix) -> Matrix:
