@@ -145,10 +145,9 @@ def _draft_columns(logs: Inspection) -> Iterator[str]:
                 remarks[role_of(role).reason].append(name)
         for reason, names in remarks.items():
             yield from wrapper.wrap(f"left out, {reason}: {listed(names, 40)}")
-    for name, found in logs.kinds.items():
-        kind = kinds()[name]
-        used = {names: value for names, value in found.items() if {*names} <= {*sensors}}
-        if line := line_of(kind, used):
+    for name, members in logs.kinds.items():
+        used = {names: value for names, value in members.items() if {*names} <= {*sensors}}
+        if line := line_of(kinds()[name], used):
             yield line
         elif used:
             yield from wrapper.wrap(f"{name}: {listed([n for names in used for n in names], 40)}")

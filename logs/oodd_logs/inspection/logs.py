@@ -75,14 +75,10 @@ class RecordingFacts:
         Number of rows of each topic.
     fields
         Values that hold for the whole recording.
-    stamps
-        Columns that the format defines to be times in seconds.
     columns
         Names of its columns, below their topics if there are several.
     clocks
         Facts of the columns that may have times, by name.
-    added
-        Columns whose times are added to those of others, such as times of day, by these.
     values
         Cells by value, of each column with few values.
     empty
@@ -97,10 +93,8 @@ class RecordingFacts:
     file: str
     rows: Mapping[str, int]
     fields: Mapping[str, Any]
-    stamps: frozenset[str]
     columns: tuple[str, ...] = ()
     clocks: dict[str, ClockFacts] = field(default_factory=dict)
-    added: dict[str, str] = field(default_factory=dict)
     values: dict[str, Mapping[float | str, int]] = field(default_factory=dict)
     empty: set[str] = field(default_factory=set)
     digest: bytes = b""
@@ -126,7 +120,6 @@ class RecordingFacts:
         """Give columns other names."""
         self.columns = tuple(new.get(name, name) for name in self.columns)
         self.clocks = {new.get(name, name): clock for name, clock in self.clocks.items()}
-        self.added = {new.get(name, name): new.get(n, n) for name, n in self.added.items()}
         self.values = {new.get(name, name): values for name, values in self.values.items()}
         self.empty = {new.get(name, name) for name in self.empty}
 
@@ -149,6 +142,10 @@ class Inspection:
         Facts of each recording, in the order of the files.
     columns
         Facts of each column by name, over all recordings.
+    added
+        Columns whose times are added to those of others, such as times of day, by these.
+    stamps
+        Columns that the format defines to be times in seconds.
     transposed
         Files whose rows and columns are exchanged; they were read so.
     equal
@@ -173,6 +170,8 @@ class Inspection:
     episode: tuple[str, ...] = ()
     recordings: list[RecordingFacts] = field(default_factory=list)
     columns: dict[str, ColumnFacts] = field(default_factory=dict)
+    added: dict[str, str] = field(default_factory=dict)
+    stamps: set[str] = field(default_factory=set)
     transposed: list[str] = field(default_factory=list)
     equal: list[list[str]] = field(default_factory=list)
     shared: dict[str, int] = field(default_factory=dict)
@@ -235,17 +234,6 @@ class Inspection:
         return {name: tuple(np.median(shares[name], axis=0)) for name in likely}
 
     @cached_property
-    def standing(self) -> set[str]:
-        """Columns with stamps that rise, but stand still too often for times of rows."""
-        standing = {n for n, (falls, repeats) in self._stuck.items() if falls < 0.01 <= repeats}
-        return standing - {*self.times}
-
-    @cached_property
-    def added(self) -> dict[str, str]:
-        """Columns whose times are added to those of others, by these."""
-        return {name: more for r in self.recordings for name, more in r.added.items()}
-
-    @cached_property
     def date_order(self) -> str:
         """Which of day and month comes first in dates; empty where none needs that.
 
@@ -256,11 +244,6 @@ class Inspection:
         orders = [o for o in (readings or [{}])[0] if all(o in other for other in readings)]
         longest = {o: max(clocks[o].steps.longest for clocks in readings) for o in orders}
         return min(orders, key=lambda order: longest[order], default="")
-
-    @cached_property
-    def stamps(self) -> frozenset[str]:
-        """Columns that the format defines to be times in seconds."""
-        return frozenset(name for r in self.recordings for name in r.stamps)
 
     @cached_property
     def labels(self) -> tuple[str, ...]:
@@ -305,11 +288,13 @@ class Inspection:
     def _basic_roles(self) -> dict[str, str]:
         """Roles of columns regardless of the files that they are in."""
         names_by_role = {"times": {*self.times, *self.added.values()}, "labels": {*self.labels}}
-        names_by_role |= {"standing": self.standing}
+        # Stamps that rise, but stand still too often for times of rows.
+        standing = {n for n, (falls, repeats) in self._stuck.items() if falls < 0.01 <= repeats}
+        names_by_role["standing"] = standing
         of_kinds: dict[str, str] = {}
         together: set[str] = set()
-        for kind, found in self.kinds.items():
-            for names in found:
+        for kind, members in self.kinds.items():
+            for names in members:
                 of_kinds |= dict.fromkeys(names, "" if kinds()[kind].sensor else kind)
                 together |= {*names} if len(names) > 1 else set()
 
@@ -434,6 +419,7 @@ class Inspection:
                 for file in spellings[other]:
                     self.ledger.add("column", "changed", reason, name=new[name], source=file)
         self.columns = {new.get(name, name): facts for name, facts in self.columns.items()}
+        self.added = {new.get(name, name): new.get(n, n) for name, n in self.added.items()}
         for recording in self.recordings if new else ():
             recording.rename(new)
 
@@ -445,13 +431,9 @@ class Inspection:
             return
         folder = self.path if self.path.name != file else self.path.parent
         source = recording.source.removeprefix(f"{folder}/")
-        facts = RecordingFacts(
-            recording.name,
-            file,
-            {name: topic.rows for name, topic in topics},
-            dict(recording.fields),
-            frozenset(f"{n}.{t.time}" if n else t.time for n, t in topics if t.time),
-        )
+        rows = {name: topic.rows for name, topic in topics}
+        facts = RecordingFacts(recording.name, file, rows, dict(recording.fields))
+        self.stamps |= {f"{n}.{t.time}" if n else t.time for n, t in topics if t.time}
         is_short = len(topics) == 1 and facts.length <= _SHORT
         if not is_short:
             self._work_off()
@@ -483,7 +465,7 @@ class Inspection:
                 with contextlib.suppress(TrajectoryError):
                     if clock := ClockFacts.of(np.concatenate(numbered), cells_of):
                         facts.clocks[names[first]] = clock
-                        facts.added.update((names[first], names[name]) for name in more)
+                        self.added.update((names[first], names[name]) for name in more)
         self.ledger.merge(recording.ledger, source)
         self.recordings.append(facts)
         if len(self._pending) >= _PENDING:
@@ -571,13 +553,11 @@ def inspect_logs(
                 # Those of a matrix, or of a text without a header, are numbered.
                 stems = {re.sub(r"\d+(\[.*\])?$", "", name) for name in columns}
                 is_matrix = len(recording.topics) == len(stems) == 1 < len(columns)
-                if result.episode:
-                    for part in split_recording(recording, result.episode, lenient=True):
-                        result.add(part, names[file])
-                elif is_matrix and "transpose" in reader.options:
+                if is_matrix and not result.episode and "transpose" in reader.options:
                     later.append((file, recording))
-                else:
-                    result.add(recording, names[file])
+                    continue
+                for part in split_recording(recording, result.episode, lenient=True):
+                    result.add(part, names[file])
         except TrajectoryError as error:
             result.problems.append(str(error))
             result.unreadable.append(names[file])

@@ -14,7 +14,7 @@ import numpy as np
 
 from oodd_eval.data.facts import ANOMALIES
 from oodd_logs.inspection.columns import ColumnFacts
-from oodd_logs.inspection.logs import SLOW, Inspection, RecordingFacts
+from oodd_logs.inspection.logs import SLOW, Inspection, RecordingFacts, grouped
 from oodd_logs.kinds.times import SCALES
 from oodd_logs.marks import NOMINAL_WORDS, likely_nominal
 from oodd_logs.stamps import GAP_STEPS
@@ -38,55 +38,61 @@ class Sorting:
 
 def fields_of(logs: Inspection) -> dict[str, Counter[Any]]:
     """Return the values of fields with few values, and episodes with each."""
-    counts: dict[str, Counter[Any]] = defaultdict(Counter)
-    for recording in logs.recordings:
-        for name, value in recording.fields.items():
-            if isinstance(value, str | bool | int) and name not in _LAYOUTS:
-                counts[name][value] += 1
+    values = grouped(
+        (name, value)
+        for recording in logs.recordings
+        for name, value in recording.fields.items()
+        if isinstance(value, str | bool | int) and name not in _LAYOUTS
+    )
     most = max(8, len(logs.recordings) // 4)
-    return {name: c for name, c in counts.items() if len(c) <= most}
+    return {name: c for name, v in values.items() if len(c := Counter(v)) <= most}
 
 
 def keys_of_fields(logs: Inspection) -> dict[str, str]:
     """Return the fields of episodes that are ``"outcome"``, ``"kinds"`` and ``"task"``, by key."""
     keys: dict[str, str] = {}
     for name, counts in fields_of(logs).items():
-        if key := _key_of(name, counts):
-            keys.setdefault(key, name)
+        if len(counts) < 2:
+            continue
+        if all(isinstance(value, bool) for value in counts):
+            keys.setdefault("outcome", name)
+        elif any(NOMINAL_WORDS.search(str(value)) for value in counts):
+            keys.setdefault("kinds", name)
+        elif _TASK.search(name):
+            keys.setdefault("task", name)
     return keys
 
 
-def nominal_values(logs: Inspection, label: str) -> tuple[float | str, ...]:
-    """Return the values of a label that are nominal, those of most rows where none says so."""
-    values: Mapping[float | str, int] = logs.columns[label].values or {}
-    likely, _ = likely_nominal(label, values)
+def nominal_values(logs: Inspection) -> tuple[float | str, ...]:
+    """Return the values of the label that are nominal, those of most rows where none says so."""
+    values: Mapping[float | str, int] = logs.columns[logs.labels[0]].values or {}
+    likely, _ = likely_nominal(logs.labels[0], values)
     return likely or (max(values, key=lambda value: values[value]),)
 
 
-def anomalous_rows(recording: RecordingFacts, label: str, nominal: Sequence[float | str]) -> int:
-    """Return the number of rows whose label has none of its nominal values."""
-    return sum(n for v, n in recording.values.get(label, {}).items() if v not in nominal)
+def anomalous_rows(logs: Inspection) -> list[int]:
+    """Return the number of rows of each recording whose label has none of its nominal values."""
+    nominal = nominal_values(logs)
+    counts = (recording.values.get(logs.labels[0], {}) for recording in logs.recordings)
+    return [sum(n for value, n in c.items() if value not in nominal) for c in counts]
 
 
 def sort_files(logs: Inspection) -> Sorting:
     """Tell files apart by labels, else by their names."""
-    files = logs.usable
-    every = {"fault": tuple(files)}
+    files, by = tuple(logs.usable), "intervals"
     if logs.labels:
-        label = logs.labels[0]
-        values = nominal_values(logs, label)
-        rows = {r.file for r in logs.recordings if anomalous_rows(r, label, values)}
+        pairs, by = zip(logs.recordings, anomalous_rows(logs), strict=True), logs.labels[0]
+        rows = {recording.file for recording, n in pairs if n}
         anomalous = [file for file in files if file in rows]
         if len(anomalous) < len(files):
-            return _by_kind(files, anomalous, f"files told apart by {label}")
-        return Sorting(tuple(files), every, f"windows told apart by {label}")
-    if logs.intervals:
-        return Sorting(tuple(files), every, "windows told apart by intervals")
+            return _by_kind(files, anomalous, f"files told apart by {by}")
+    if logs.labels or logs.intervals:
+        return Sorting(files, {"fault": files}, f"windows told apart by {by}")
     words = {file: str(Path(file).with_suffix("")).replace("_", " ") for file in files}
     anomalous = [file for file in files if not NOMINAL_WORDS.search(words[file])]
     if len(anomalous) < len(files) and not {"outcome", "kinds"} & {*keys_of_fields(logs)}:
         return _by_kind(files, anomalous, "files told apart by their names")
-    return Sorting(tuple(files), {}, "")
+    return Sorting(files, {}, "")
 
 
 def _by_kind(files: Sequence[str], anomalous: Sequence[str], reason: str) -> Sorting:
@@ -133,13 +139,11 @@ def window_of(logs: Inspection) -> int:
 
 def lacks_rows(logs: Inspection) -> bool:
     """Tell whether recordings are anomalous of which nothing says since which row."""
-    keys, anomalous = keys_of_fields(logs), sort_files(logs).anomalous
     if logs.labels or logs.intervals:
         return False
-    if {"outcome", "kinds"} & {*keys}:
-        return True
-    files = {file for names in anomalous.values() for file in names}
-    return any(r.file in files and "onset" not in r.fields for r in logs.recordings)
+    files = {file for names in sort_files(logs).anomalous.values() for file in names}
+    without = any(r.file in files and "onset" not in r.fields for r in logs.recordings)
+    return without or bool({"outcome", "kinds"} & {*keys_of_fields(logs)})
 
 
 def nominal_recordings(logs: Inspection) -> list[RecordingFacts]:
@@ -188,14 +192,3 @@ def lacks_values(name: str, facts: ColumnFacts) -> bool:
     """Tell whether values are missing, other than commands after the last observation."""
     after = name.startswith(("action:", "reward")) and facts.missing <= facts.recordings
     return bool(facts.missing or facts.words) and not facts.constant and not after
-
-
-def _key_of(name: str, counts: Counter[Any]) -> str:
-    """Return the key of a recipe that a field looks like; an empty text for none."""
-    if len(counts) < 2:
-        return ""
-    if all(isinstance(value, bool) for value in counts):
-        return "outcome"
-    if any(NOMINAL_WORDS.search(str(value)) for value in counts):
-        return "kinds"
-    return "task" if _TASK.search(name) else ""

@@ -29,6 +29,7 @@ from oodd_logs.inspection.meaning import (
 )
 from oodd_logs.inspection.roles import ROLES, line_of, role_of, toml
 from oodd_logs.kinds import kinds
+from oodd_logs.kinds.number_lists import FIGURES
 from oodd_logs.kinds.times import SCALES, UNIT_NAMES
 from oodd_logs.marks import likely_nominal, plain_label
 from oodd_logs.readers import quantity
@@ -145,9 +146,9 @@ def _of_columns(logs: Inspection) -> Iterator[Advice]:
         text += f", {counted(leading, 'row(s)')} at the start" if leading else ""
         most = f", missing_rows = {longest}" if longest > MISSING_ROWS else ""
         yield Advice("missing", f'{text}: write missing = "hold"{most}')
-    for name, found in logs.kinds.items():
-        kind, names = kinds()[name], [n for together in found for n in together]
-        text = kind.words.format(names=listed(names), line=line_of(kind, found))
+    for name, members in logs.kinds.items():
+        kind, names = kinds()[name], [n for together in members for n in together]
+        text = kind.words.format(names=listed(names), line=line_of(kind, members))
         yield Advice(f"{name}s", text)
     if coarse := [name for name, c in plain.items() if c.coarse]:
         spread, mean = plain[coarse[0]].numbers.spread, plain[coarse[0]].numbers.mean
@@ -163,10 +164,10 @@ def _of_labels(logs: Inspection) -> Iterator[Advice]:
         text = f'{logs.intervals} names rows of files: write intervals = "{logs.intervals}"'
         yield Advice("intervals", text)
     if labels := logs.labels:
-        values = nominal_values(logs, labels[0])
+        values = nominal_values(logs)
         _, reason = likely_nominal(labels[0], logs.columns[labels[0]].values or {})
         plain = [*map(plain_label, values)]
-        anomalous = [anomalous_rows(r, labels[0], values) for r in logs.recordings]
+        anomalous = anomalous_rows(logs)
         rows = sum(sum(r.values.get(labels[0], {}).values()) for r in logs.recordings)
         text = f"{labels[0]} may say what is anomalous: {sum(anomalous)} of {rows} rows, in "
         text += f"{sum(map(bool, anomalous))} of {counted(len(logs.recordings), 'episode(s)')}: "
@@ -197,24 +198,20 @@ def _of_labels(logs: Inspection) -> Iterator[Advice]:
 def looks_like(logs: Inspection) -> dict[str, str]:
     """Return in words what each column looks like; an empty text for a plain number."""
     of_kinds = {
-        name: f"{kind}: {value if isinstance(value, str) else number(value)}" if value else kind
-        for kind, found in logs.kinds.items()
-        for names, value in found.items()
+        name: f"{kind}: {number(value)}" if value else kind
+        for kind, members in logs.kinds.items()
+        for names, value in members.items()
         for name in names
     }
-
-    def looks(name: str) -> str:
-        facts, role = logs.columns[name], logs.roles[name]
-        values = "many values"
-        if facts.values is not None:
-            texts = sorted(facts.values, key=str)
-            values = ", ".join(v if isinstance(v, str) else number(v) for v in texts)
-        words = {"kind": of_kinds.get(name, ""), "values": values}
+    looks = {}
+    for name, role in logs.roles.items():
+        facts, words = logs.columns[name], {"kind": of_kinds.get(name, "")}
         words["unit"] = UNIT_NAMES.get(logs.times.get(name, ""), "added")
-        coarse = "float32 is too coarse" if facts.coarse else ""
-        return (role_of(role).looks.format_map(words) if role else "") or words["kind"] or coarse
-
-    return {name: looks(name) for name in logs.columns}
+        texts = map(number, sorted(facts.values or {}, key=str))
+        words["values"] = "many values" if facts.values is None else ", ".join(texts)
+        in_words = role_of(role).looks.format_map(words) if role else ""
+        looks[name] = in_words or words["kind"] or "float32 is too coarse" * facts.coarse
+    return looks
 
 
 def describe_logs(logs: Inspection, width: int = 80) -> str:
@@ -234,16 +231,12 @@ def describe_logs(logs: Inspection, width: int = 80) -> str:
     """
     files = len({recording.file for recording in logs.recordings})
     lengths = [recording.length for recording in logs.recordings] or [0]
-    heading = (
-        f"{logs.path.name or logs.path}: {logs.form}, {counted(files, 'file(s)')}, "
-        f"{counted(len(logs.recordings), 'episode(s)')} "
-        + (f"by {listed(logs.episode)} " if logs.episode else "")
-        + f"of {min(lengths)}"
-    )
-    if min(lengths) < max(lengths):
-        heading += f" to {max(lengths)} rows, {np.median(lengths):g} in the median"
-    else:
-        heading += " rows"
+    least, most = min(lengths), max(lengths)
+    span = f"{least} to {most} rows, {np.median(lengths):g} in the median"
+    heading = f"{logs.path.name or logs.path}: {logs.form}, {counted(files, 'file(s)')}, "
+    heading += f"{counted(len(logs.recordings), 'episode(s)')} "
+    heading += f"by {listed(logs.episode)} " if logs.episode else ""
+    heading += f"of {span if least < most else f'{most} rows'}"
     parts = ["\n".join(textwrap.wrap(heading, width))]
     if len(logs.topics) > 1:
         parts.append(_topic_table(logs))
@@ -253,12 +246,11 @@ def describe_logs(logs: Inspection, width: int = 80) -> str:
     lines = [entry.line(len(logs.recordings)) for entry in said[:_LINES]]
     lines += [f"{len(said) - _LINES} more, which --json has"] if len(said) > _LINES else []
     advice = [*advise(logs), *(Advice("ledger", line) for line in lines)]
-    if advice:
-        indent = max(len(topic) for topic, _ in advice) + 2
-        wrapper = textwrap.TextWrapper(min(width, 110), break_on_hyphens=False)
-        wrapper.subsequent_indent = " " * indent
-        parts.append("\n".join(wrapper.fill(f"{a.topic:{indent}}{a.text}") for a in advice))
-    return "\n\n".join(parts)
+    indent = max((len(topic) for topic, _ in advice), default=0) + 2
+    wrapper = textwrap.TextWrapper(min(width, 110), break_on_hyphens=False)
+    wrapper.subsequent_indent = " " * indent
+    parts.append("\n".join(wrapper.fill(f"{a.topic:{indent}}{a.text}") for a in advice))
+    return "\n\n".join(filter(None, parts))
 
 
 def _topic_table(logs: Inspection) -> str:
@@ -283,12 +275,16 @@ def _column_table(logs: Inspection, width: int) -> str:
     rows = []
     for name in names:
         facts, column = logs.columns[name], quantity(name) if _WITH_UNIT.fullmatch(name) else None
-        unit = column.unit if column and column.unit != "1" else ""
-        span = ["", ""]
-        if not (facts.text or facts.empty):
-            span = [number(facts.numbers.low), number(facts.numbers.high)]
+        title, unit = (column.name, column.unit) if column and column.unit != "1" else (name, "")
+        stem, _, figure = name.rpartition(".")
+        if figure in FIGURES and {f"{stem}.{each}" for each in FIGURES} <= {*names}:
+            if figure != "mean":  # which stands for the list
+                continue
+            title = f"{stem}.{'/.'.join(FIGURES)}"
+        span = [] if facts.text or facts.empty else [facts.numbers.low, facts.numbers.high]
+        low, high = map(number, span or ["", ""])
         missing = _share(facts.missing / facts.cells) if facts.missing else ""
-        rows.append([column.name if unit and column else name, unit, *span, missing, looks[name]])
+        rows.append([title, unit, low, high, missing, looks[name]])
     header = ["column", "unit", "from", "to", "missing", "looks like"]
     kept = [i for i, title in enumerate(header) if i < 1 or any(row[i] for row in rows)]
     before = sum(max([len(header[i]), *(len(row[i]) for row in rows)]) + 2 for i in kept if i < 5)
@@ -298,22 +294,24 @@ def _column_table(logs: Inspection, width: int) -> str:
     align = ["right" if 1 < i < 5 else "left" for i in kept] if rows else None
     table = tabulate(cells, titles, "simple", colalign=align, disable_numparse=True)
     text = "\n".join(line.rstrip() for line in table.splitlines())
-    left_out = len(looks) - len(names)
-    more = f"\n\nand {left_out} more columns, most of them plain numbers or constants"
-    return text + (more if left_out else "")
+    if left_out := len(looks) - len(names):
+        text += f"\n\nand {left_out} more columns, most of them plain numbers or constants"
+    return text
 
 
 _WITH_UNIT: Final = re.compile(r"[^\[\]]+(\[[^\[\]]+\])?")
 
 
-def number(value: float) -> str:
-    """Return a number as a table has it, whole ones without a point.
+def number(value: float | str) -> str:
+    """Return a number as a table has it, whole ones without a point; a text as it is.
 
     Examples
     --------
     >>> number(3.0), number(0.0265878), number(5400123.25)
     ('3', '0.02659', '5400123')
     """
+    if isinstance(value, str):
+        return value
     if np.isfinite(value) and value == round(value) and abs(value) < 1e7:
         return str(int(value))
     return f"{value:.4g}" if abs(value) < 1e4 else f"{value:.7g}"
@@ -338,8 +336,8 @@ def as_json(logs: Inspection) -> dict[str, Any]:
     looks = looks_like(logs)
     columns = []
     for name, facts in logs.columns.items():
-        moments = facts.numbers if facts.numbers.count else None
-        span = {k: float(getattr(moments, k)) if moments else None for k in ("low", "high", "mean")}
+        moments = {k: getattr(facts.numbers, k) for k in ("low", "high", "mean")}
+        span = {k: float(x) if facts.numbers.count else None for k, x in moments.items()}
         counts = {k: getattr(facts, k) for k in ("recordings", "cells", "missing")}
         role = {"role": logs.roles[name] or "sensor", "looks": looks[name]}
         columns.append({"name": name, **role, **counts, **span})
@@ -350,8 +348,8 @@ def as_json(logs: Inspection) -> dict[str, Any]:
         "times": logs.times,
         "columns": columns,
         "kinds": {
-            kind: [{"columns": names, "value": value} for names, value in found.items()]
-            for kind, found in logs.kinds.items()
+            kind: [{"columns": names, "value": value} for names, value in members.items()]
+            for kind, members in logs.kinds.items()
         },
         "advice": [advice._asdict() for advice in advise(logs)],
         "ledger": logs.ledger.as_json(),

@@ -79,13 +79,13 @@ def recognise(columns: Mapping[str, Any]) -> Recognised:
         for key, value in kind.recognise(columns).items()
         for names in [(key,) if isinstance(key, str) else tuple(key)]
     ]
-    found: dict[str, dict[tuple[str, ...], Any]] = {}
+    members: dict[str, dict[tuple[str, ...], Any]] = {}
     taken: set[str] = set()
     for _, kind_name, names, value in sorted(pairs, key=lambda pair: -pair[0]):
         if taken.isdisjoint(names):
-            found.setdefault(kind_name, {})[names] = value
+            members.setdefault(kind_name, {})[names] = value
             taken |= {*names}
-    return found
+    return members
 
 
 def line_of(kind: Kind, values: Mapping[tuple[str, ...], Any]) -> str:

@@ -41,10 +41,10 @@ def _beside_names(name: str, value: Mapping[str, Any]) -> Pairs | None:
     plain = [v for v in others if not isinstance(v[0], Mapping)]
     if any(len(v) != len(items) for v in plain):  # those of equal length are so by chance
         return None
-    made = [(key, _named(inner, items)) for key, inner in value.items() if key != names]
-    if not any(inner is not value[key] for key, inner in made):
+    items_by_key = [(key, _named(inner, items)) for key, inner in value.items() if key != names]
+    if not any(inner is not value[key] for key, inner in items_by_key):
         return None
-    return [(f"{name}.{key}" if name else key, inner) for key, inner in made]
+    return [(f"{name}.{key}" if name else key, inner) for key, inner in items_by_key]
 
 
 def _named(value: Any, names: Sequence[str]) -> Any:

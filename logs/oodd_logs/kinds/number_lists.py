@@ -23,8 +23,8 @@ def figures(name: str, rows: NDArray[np.float64]) -> dict[str, NDArray[np.float6
     {'r.least': array([1.]), 'r.mean': array([2.]), 'r.count': array([2.])}
     """
     owners = np.repeat(np.arange(len(rows)), rows.size // max(1, len(rows)))
-    made = ragged_figures(rows.ravel(), owners, len(rows))
-    return {f"{name}.{figure}": column for figure, column in made.items()}
+    columns = ragged_figures(rows.ravel(), owners, len(rows))
+    return {f"{name}.{figure}": column for figure, column in columns.items()}
 
 
 def ragged_figures(

@@ -102,26 +102,27 @@ def numbers(cells: Sequence[str], decimal: str = ".", *, strict: bool = False) -
 def mixed(cells: Column) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return the numbers of a column of texts, NaN elsewhere, and which cells are other texts.
 
-    Cells without a value are neither. Kinds of columns say which other texts are numbers.
+    Cells without a value are neither. Kinds of columns say which other texts are numbers. Decimals
+    stand behind the mark that makes numbers of most cells, a point if both do.
 
-    >>> mixed(np.array(["1.5", "", "open", "nan", "2,5"]))
-    (array([1.5, nan, nan, nan, 2.5]), array([False, False,  True, False, False]))
+    >>> mixed(np.array(["1.5", "", "open", "nan", "1,234"]))
+    (array([1.5, nan, nan, nan, nan]), array([False, False,  True, False,  True]))
     """
     every = cells.tolist()
-    if not any(_number_of(cell) is not None for cell in every[:: max(1, len(every) // _PROBED)]):
+    probed = every[:: max(1, len(every) // _PROBED)]
+    if not any(_number_of(cell, mark) is not None for cell in probed for mark in ".,"):
         return np.full(len(cells), np.nan), np.strings.str_len(cells) > 0
-    values = {cell: _number_of(cell) for cell in {*every}}
-    others = [cell for cell, value in values.items() if value is None]
-    values |= read_texts(others)
+    readings = [{cell: _number_of(cell, mark) for cell in {*every}} for mark in ".,"]
+    values = max(readings, key=lambda read: sum(read[cell] is not None for cell in every))
+    values |= read_texts([cell for cell, value in values.items() if value is None])
     column = [values[cell] for cell in every]
     words = np.array([value is None for value in column], np.bool_)
     return np.array(column, np.float64), words
 
 
-def _number_of(cell: str) -> float | None:
-    for decimal in ".,":
-        with contextlib.suppress(ValueError):
-            return number(cell, decimal)
+def _number_of(cell: str, decimal: str) -> float | None:
+    with contextlib.suppress(ValueError):
+        return number(cell, decimal)
     return None
 
 
