@@ -27,8 +27,8 @@ from oodd_logs.marks import (
 from oodd_logs.readers.cells import mixed
 from oodd_logs.readers.packed import stem
 from oodd_logs.recipe import Recipe, anomaly_name
-from oodd_logs.recording import Recording
-from oodd_logs.rows import TopicRows, read_column
+from oodd_logs.recording import Recording, read_column
+from oodd_logs.rows import TopicRows
 from oodd_logs.selecting import Selection, find_columns, layout_of, named_columns
 from oodd_logs.stamps import Steps, Stretch, Times, check_stamps, cut_at_gaps, on_grid, set_forward
 

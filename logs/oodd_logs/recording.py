@@ -5,7 +5,7 @@ A recording is a file, a group of a file, or an episode of a data set. It has to
 Rows are read when asked for, in ranges, so that a recording may be larger than memory.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -21,6 +21,10 @@ Column = NDArray[Any]
 
 MISSING: Final = frozenset({"", "nan", "-nan", "na", "n/a", "null", "none"})
 """Texts, in lower case, that stand for a value that is missing."""
+
+
+CELLS: Final = 1 << 18
+"""Cells that are read at once."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,3 +111,9 @@ class Recording:
     topics: Mapping[str, Topic]
     fields: Mapping[str, Any] = field(default_factory=dict)
     ledger: Ledger = field(default_factory=Ledger)
+
+
+def read_column(topic: Topic, column: str) -> Iterator[tuple[int, Column]]:
+    """Yield the first row and the cells of blocks of a column."""
+    for start in range(0, topic.rows, CELLS):
+        yield start, topic.read([column], start, min(start + CELLS, topic.rows))[column]

@@ -6,7 +6,7 @@ Nothing here holds more than a block of a recording; what comes out is float64.
 import contextlib
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, Final, cast
 
@@ -21,19 +21,12 @@ from oodd_logs.kinds.naming import matching
 from oodd_logs.ledger import Ledger
 from oodd_logs.readers.cells import mixed
 from oodd_logs.recipe import Recipe
-from oodd_logs.recording import Column, Recording, Topic
+from oodd_logs.recording import CELLS, Column, Recording, read_column
 from oodd_logs.selecting import ChosenColumn, Selection
 from oodd_logs.stamps import Stretch
 
-_CELLS: Final = 1 << 18  # that are read at once
 _MOST_CHOICES: Final = 64
 _MOST_ACTIONS: Final = 1000  # of discrete ones, each a column
-
-
-def read_column(topic: Topic, column: str) -> Iterator[tuple[int, NDArray[Any]]]:
-    """Yield the first row and the cells of blocks of a column."""
-    for start in range(0, topic.rows, _CELLS):
-        yield start, topic.read([column], start, min(start + _CELLS, topic.rows))[column]
 
 
 class TopicRows:
@@ -70,7 +63,7 @@ class TopicRows:
         self._position = 0
         self._last = np.full(len(self._columns), np.nan)
         self._runs = np.zeros(len(self._columns), np.int64)
-        self._step = max(64, _CELLS // max(1, len(self._columns)))
+        self._step = max(64, CELLS // max(1, len(self._columns)))
         self._words: dict[str, Column] = {}  # texts among the numbers that were read last
         self._shares: dict[str, str] = {}
 
@@ -388,7 +381,7 @@ class Spool:
         OutputError
             When the disk is full.
         """
-        step = max(64, _CELLS // self._width)
+        step = max(64, CELLS // self._width)
         width = sum(len(rows.indices) for rows in topics.values())
         for start in range(0, stretch.rows, step):
             stop = min(start + step, stretch.rows)

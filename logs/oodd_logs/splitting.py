@@ -23,8 +23,7 @@ from oodd_logs.ledger import Ledger
 from oodd_logs.marks import plain_label
 from oodd_logs.readers import reader_for
 from oodd_logs.recipe import Recipe
-from oodd_logs.recording import MISSING, Column, Recording, Topic
-from oodd_logs.rows import read_column
+from oodd_logs.recording import MISSING, Column, Recording, Topic, read_column
 from oodd_logs.selecting import find_columns, layout_of, named_columns
 
 TERMINAL: Final = re.compile(r"(?:is_)?termina(?:ls?|ted|tions?)")

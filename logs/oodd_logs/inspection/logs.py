@@ -57,7 +57,8 @@ _LABEL: Final = re.compile(
     re.IGNORECASE,
 )
 _DAY: Final = 86400  # seconds
-_Key, _Value = TypeVar("_Key"), TypeVar("_Value")
+_Key = TypeVar("_Key")
+_Value = TypeVar("_Value")
 _INTERVALS: Final = ({"file", "start"}, {"file", "onset"})
 
 

@@ -12,10 +12,10 @@ from oodd_logs.kinds.naming import matching, wrong_value
 
 def sine_and_cosine(position: int, sensor: Quantity, period: float) -> Conversion:
     """Return what makes sine and cosine of a sensor that begins anew after a period."""
-    sine, cosine = ("sine", "cosine") if sensor.role == "angle" else (sensor.role, sensor.role)
-    outputs = tuple(
-        Quantity(f"{function} {sensor.name}", "1", role)
-        for function, role in (("sin", sine), ("cos", cosine))
+    is_angle = sensor.role == "angle"
+    outputs = (
+        Quantity(f"sin {sensor.name}", "1", "sine" if is_angle else sensor.role),
+        Quantity(f"cos {sensor.name}", "1", "cosine" if is_angle else sensor.role),
     )
 
     def convert(rows: Matrix) -> Matrix:
