@@ -415,9 +415,9 @@ class Inspection:
             files = dict.fromkeys(r.file for r in self.recordings if name in r.columns)
             spellings = {name: [file for file in files if file not in otherwise], **others}
             new[name] = max(spellings, key=lambda spelling: len(spellings[spelling]))
-            for other in spellings.keys() - {new[name]}:
+            for other, spelled in spellings.items():
                 reason = f"taken from {other!r}, as the file lacks it"
-                for file in spellings[other]:
+                for file in spelled if other != new[name] else ():
                     self.ledger.add("column", "changed", reason, name=new[name], source=file)
         self.columns = {new.get(name, name): facts for name, facts in self.columns.items()}
         self.added = {new.get(name, name): new.get(n, n) for name, n in self.added.items()}
@@ -709,16 +709,11 @@ def _time_columns(topic: Topic, block: Mapping[str, Column]) -> list[tuple[str, 
     pairs = pairs_of(topic.names) if not topic.time else {}
     dates, times = ([n for n in texts if texts[n] == kind] for kind in ("date", "time of day"))
     pairs |= dict(zip(dates[:1], times[:1], strict=False))
-    plain = [*texts, *(name for name in block if _may_be_time(topic, name, block[name]))]
+    numbers = [n for n in block if block[n].dtype.kind != "U" and names_time(n)]
+    likely = [topic.time] if topic.time else numbers
+    plain = [*texts, *(n for n in likely if n == topic.time or unit_of(split_unit(n)[1] or "s"))]
     single = [(name,) for name in plain if name not in {*pairs, *pairs.values()}]
     return [*pairs.items(), *single]
-
-
-def _may_be_time(topic: Topic, name: str, cells: Column) -> bool:
-    if cells.dtype.kind == "U" or topic.time:
-        return name == topic.time
-    unit = split_unit(name)[1]
-    return names_time(name) and (not unit or bool(unit_of(unit)))
 
 
 def _blocks(topic: Topic) -> Iterator[tuple[int, dict[str, Column]]]:

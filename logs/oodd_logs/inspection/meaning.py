@@ -6,9 +6,8 @@
 import re
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -27,8 +26,7 @@ ENOUGH: Final = 38
 _LAYOUTS: Final = {"onset", "seed", "terminated", "truncated", "parameters", "discrete", "start"}
 
 
-@dataclass(frozen=True, slots=True)
-class Sorting:
+class Sorting(NamedTuple):
     """Nominal files, and the files of each anomaly."""
 
     nominal: tuple[str, ...]
@@ -133,8 +131,7 @@ def window_of(logs: Inspection) -> int:
     window = max(_SHORTEST, int(rows) // _WINDOWS)
     if len(nominal) >= ENOUGH or rows < 20 * window:
         return 0
-    digits = len(str(window)) - 2
-    return int(round(window, -digits)) if digits > 0 else window
+    return int(round(window, -max(0, len(str(window)) - 2)))
 
 
 def lacks_rows(logs: Inspection) -> bool:

@@ -1,6 +1,6 @@
 """Images, clouds of points and other bytes in messages: no sensors, so that they are left out."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Any, Final
 
 import numpy as np
@@ -17,20 +17,14 @@ PIXELS: Final = 4096
 
 def _flatten(_name: str, value: Any) -> Iterable[tuple[str, Any]] | None:
     """Return nothing in place of bytes; None for all else."""
-    if isinstance(value, dict):
-        return None
+    is_image = isinstance(value, bytes | bytearray | memoryview)
     if isinstance(value, str):
-        return () if len(value) > LONGEST_TEXT else None
-    if isinstance(value, bytes | bytearray | memoryview):
-        return ()
-    if isinstance(value, np.ndarray):
-        return () if value.dtype.itemsize == 1 and value.size > LONGEST else None
-    if isinstance(value, list) and len(value) > LONGEST and isinstance(value[0], Mapping | list):
-        return None
-    if isinstance(value, list) and len(value) > PIXELS:
-        pixels = all(type(x) is int and 0 <= x < 256 for x in value)
-        return () if pixels else None
-    return None
+        is_image = len(value) > LONGEST_TEXT
+    elif isinstance(value, np.ndarray):
+        is_image = value.dtype.itemsize == 1 and value.size > LONGEST
+    elif isinstance(value, list) and len(value) > PIXELS:
+        is_image = all(type(x) is int and 0 <= x < 256 for x in value)
+    return () if is_image else None
 
 
 KIND: Final = Kind("images", "an image or other bytes: no sensor", flatten=_flatten)

@@ -198,10 +198,8 @@ def orders_of(*columns: Column) -> tuple[str, ...]:
         if match and match["first"] and len(match["first"]) < 3 and match["second"].isdigit():
             pairs.add((int(match["first"]), int(match["second"])))
         halves = halves or bool(match and match["half"])
-    if not pairs:
-        return ()
-    orders = ["day first"] if all(month <= 12 for _, month in pairs) else []
-    orders += ["month first"] if all(month <= 12 for month, _ in pairs) else []
+    months = {"day first": 1, "month first": 0}
+    orders = [o for o, i in months.items() if pairs and max(pair[i] for pair in pairs) <= 12]
     return tuple(orders[::-1] if halves else orders)
 
 
