@@ -8,6 +8,7 @@ import dataclasses
 import glob
 import itertools
 import unicodedata
+import warnings
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -480,17 +481,17 @@ class _Reading:
             return
         selection, first = self._selected(recording)
         outcome, kind, task = self._outcome_kind_and_task(recorded)
+        recorded = dataclasses.replace(recorded, kind=kind)
         stamped = StampedRows(recorded, selection, recipe, ledger)
         marks = stamped.marks(self.intervals, is_anomalous=bool(kind or recorded.kinds))
         stretches, times = stamped.stretches()
-        is_cut, numbers = len(stretches) > 1, itertools.count()
+        numbers = itertools.count()
         for stretch in stretches:
             above = first.spool.rows
             first.spool.add(stretch, stamped.topics, recording.source)
             rows = rows_of(marks, stretch.positions, stretch.tolerance)
-            for part, start, stop, inside, is_piece in self._cut(
-                recorded, kind, stretch.rows, rows, is_cut=is_cut
-            ):
+            pieces = self._cut(recorded, stretch.rows, rows, is_cut=len(stretches) > 1)
+            for part, start, stop, inside, is_piece in pieces:
                 piece = next(numbers)
                 name = f"{recording.name}#{piece}" if is_piece else recording.name
                 is_nominal = part in NOMINAL_ROLES
@@ -584,13 +585,7 @@ class _Reading:
         return outcome, kind, value(recipe.task) or ""
 
     def _cut(
-        self,
-        recorded: Recorded,
-        kind: str,
-        total: int,
-        rows: Sequence[AnomalousRows],
-        *,
-        is_cut: bool,
+        self, recorded: Recorded, total: int, rows: Sequence[AnomalousRows], *, is_cut: bool
     ) -> Iterator[tuple[str, int, int, Sequence[AnomalousRows], bool]]:
         """Yield part, rows and anomalous rows of the episodes of a stretch, and if it was cut."""
         windows: dict[int, set[str]] = {}
@@ -610,7 +605,7 @@ class _Reading:
                     for a, b, name in rows
                     if b > start and a < stop
                 ]
-                parts = self._parts_of(recorded, roles, kind, inside, is_piece=is_piece)
+                parts = self._parts_of(recorded, roles, inside, is_piece=is_piece)
                 # A short last window is kept where it is labelled, and where all are judged.
                 is_plain = NOMINAL_ROLES & {*parts} or (parts and not inside)
                 if stop - start < length and is_plain and not self.every:
@@ -627,49 +622,42 @@ class _Reading:
                     yield from ((part, start, stop, inside, is_piece) for part in parts)
 
     def _parts_of(
-        self,
-        recorded: Recorded,
-        roles: set[str],
-        kind: str,
-        inside: Sequence[AnomalousRows],
-        *,
-        is_piece: bool,
+        self, recorded: Recorded, roles: set[str], rows: Sequence[AnomalousRows], *, is_piece: bool
     ) -> list[str]:
         """Return the parts that an episode of a recording belongs to."""
         source, recipe = recorded.source, self.recipe
-        if kind:
-            return [f"test/{kind}"]
+        if recorded.kind:
+            return [f"test/{recorded.kind}"]
         nominal = sorted(roles & NOMINAL_ROLES)
         kinds = sorted(role.removeprefix("test/") for role in roles - NOMINAL_ROLES)
         unsaid = [] if any(map(self._says_rows, kinds)) else [f"test/{name}" for name in kinds]
         if self.every:
-            named = [name for *_, name in inside if name]
+            named = [name for *_, name in rows if name]
             said = [f"test/{(named or kinds or [_ANOMALOUS])[0]}"]
-            return said if inside else unsaid[:1] or [EVERY]
+            return said if rows else unsaid[:1] or [EVERY]
         if recipe.kinds or recipe.outcome:
             if not nominal:
                 reason = "nominal, in files of an anomaly alone"
                 self.ledger.add("recording", "dropped", reason, source=recorded.label)
             return nominal
-        if not inside and (nominal or recipe.paired or unsaid):
+        if not rows and (nominal or recipe.paired or unsaid):
             return nominal or [f"test/{name}" for name in kinds]
-        labelled = {name for *_, name in inside}
+        labelled = {name for *_, name in rows}
         # Intervals may name an anomaly that has no files of its own.
         fileless = {n for n in labelled if n and not recipe.anomalous.get(n, _NO_FILES).files}
         if matching := [n for n in sorted({*kinds} | fileless) if labelled & {"", n}]:
             return [f"test/{name}" for name in matching]
         # Problems are raised at the end: names in a list of intervals, or labels, may be wrong.
-        if is_piece or (inside and not nominal):
+        if is_piece or (rows and not nominal):
             reason = "windows of anomalous recordings without an anomalous row"
-            reason = "windows with anomalous rows, of nominal files" if inside else reason
+            reason = "windows with anomalous rows, of nominal files" if rows else reason
             self.ledger.add("episode", "dropped", reason, source=recorded.label)
-        elif inside:
-            start, stop, _ = inside[0]
+        elif rows:
+            span = f"{max(rows[0][0], 0)} to {rows[0][1] - 1}"
             self.problems.append(
-                f"{source} is listed as nominal, but is anomalous in rows {max(start, 0)} to "
-                f"{stop - 1}: list it under [anomalous.NAME], or cut it with window, so that the "
-                "windows without anomalous rows are nominal; labels of nominal rows other than 0, "
-                "false, H or nothing are named by nominal_label"
+                f"{source} is listed as nominal, but is anomalous in rows {span}: list it under "
+                "[anomalous.NAME], or cut it with window, so that windows without anomalous rows "
+                "are nominal; nominal_label names labels other than 0, false, H or nothing"
             )
         else:
             labels = {*recipe.labels, *(t for k in kinds for t in recipe.anomalous[k].labels)}
@@ -815,9 +803,9 @@ class _Reading:
 
     def _notes(self, source: EpisodeSource) -> list[str]:
         recipe = self.recipe
-        sensors = counted(len(source.sensors), "sensor(s)")
-        actions = counted(len(source.actions), "action(s)")
-        lines = [f"read {counted(self.recordings, 'recording(s)')}: {sensors}, {actions}"]
+        columns = f"{counted(len(source.sensors), 'sensor(s)')}, "
+        columns += counted(len(source.actions), "action(s)")
+        lines = [f"read {counted(self.recordings, 'recording(s)')}: {columns}"]
         for part, episodes in source.parts.items():
             rows = sum(facts.rows for facts in episodes)
             line = f"{part}: {counted(len(episodes), 'episode(s)')}, {counted(rows, 'row(s)')}"
@@ -862,25 +850,20 @@ def _in_order(selection: Selection, first: _First, source: str) -> Selection:
     if selection == first.selection:
         return selection
     ordered: dict[str, tuple[ChosenColumn, ...]] = {}
+    unused = selection.unused
     for kind in ("sensors", "actions"):
         expected = [column.quantity for column in getattr(first.selection, kind)]
         by_name = {column.quantity: column for column in getattr(selection, kind)}
-        if lacking := [q for q in expected if q not in by_name]:
-            names = ", ".join(f"{q.name}[{q.unit}]" for q in lacking[:6])
+        if lacking := [f"{q.name}[{q.unit}]" for q in expected if q not in by_name]:
             raise TrajectoryError(
-                f"{source} has {len(getattr(selection, kind))} {kind}, {first.source} "
-                f"{len(expected)}: it lacks {names}; expected the same in all files, by name and "
-                "unit"
+                f"{source} has {len(by_name)} {kind}, {first.source} {len(expected)}: it lacks "
+                f"{', '.join(lacking[:6])}; expected the same in all files, by name and unit"
             )
         ordered[kind] = tuple(by_name[quantity] for quantity in expected)
+        unused += tuple(quantity.name for quantity in by_name if quantity not in expected)
     if (selection.reward is None) != (first.selection.reward is None):
         raise TrajectoryError(f"{source}: only some of the files have rewards")
-    shared = {*ordered["sensors"], *ordered["actions"]}
-    further = (c for c in (*selection.sensors, *selection.actions) if c not in shared)
-    unused = (*selection.unused, *(column.quantity.name for column in further))
-    return dataclasses.replace(
-        selection, sensors=ordered["sensors"], actions=ordered["actions"], unused=unused
-    )
+    return dataclasses.replace(selection, unused=unused, **ordered)
 
 
 def _say_far(source: EpisodeSource) -> None:
@@ -888,23 +871,20 @@ def _say_far(source: EpisodeSource) -> None:
     every = [facts for episodes in source.parts.values() for facts in episodes]
     width, total = len(source.sensors), sum(facts.rows for facts in every)
     step = max(1, total * width // _SAMPLED)
-    sampled, largest = [np.zeros((0, width))], np.zeros(width)
-    for facts in every:
-        for rows in source.blocks(facts):
-            finite = np.where(np.isfinite(rows[:, :width]), rows[:, :width], np.nan)
-            largest = np.fmax(largest, np.nanmax(np.abs(finite), axis=0, initial=0.0))
-            sampled.append(finite[::step].copy())
+    sampled = [rows[::step, :width].copy() for facts in every for rows in source.blocks(facts)]
     sample = np.concatenate(sampled)
-    for d, sensor in enumerate(source.sensors):
-        values = sample[~np.isnan(sample[:, d]), d]
-        low, centre, high = np.quantile(values, [0.05, 0.5, 0.95]) if len(values) else np.zeros(3)
-        most = FAR * (high - low) / 2 or np.inf
-        for facts in every if largest[d] + abs(centre) > most else []:
-            column = source.rows(facts, 0, facts.rows)[:, d]
-            for row in np.flatnonzero(np.abs(column - centre) > most).tolist():
-                entry: dict[str, Any] = {"source": facts.episode.name, "cell": f"{column[row]:g}"}
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # no value
+        finite = np.where(np.isfinite(sample), sample, np.nan)
+        low, centre, high = np.nanquantile(finite, [0.05, 0.5, 0.95], axis=0)
+    most = np.where(high > low, FAR * (high - low) / 2, np.inf)
+    for facts in every:
+        for i, rows in enumerate(source.blocks(facts)):
+            far = np.isfinite(rows[:, :width]) & (np.abs(rows[:, :width] - centre) > most)
+            for row, d in np.argwhere(far).tolist():
+                name, cell = source.sensors[d].name, f"{rows[row, d]:g}"
+                at: dict[str, Any] = {"source": facts.episode.name, "row": i * _BLOCK + row}
                 reason = "no measurement by its size"
-                source.ledger.add("cell", "kept", reason, name=sensor.name, row=row, **entry)
+                source.ledger.add("cell", "kept", reason, name=name, cell=cell, **at)
 
 
 def _settle_columns(source: EpisodeSource, recipe: Recipe) -> None:
@@ -927,11 +907,9 @@ def _settle_columns(source: EpisodeSource, recipe: Recipe) -> None:
     # What training never shows may still move later.
     spread = np.where(train.low == train.high, every.high - every.low, train.spread)
     if (every.largest > np.finfo(np.float32).max / 2).any():
-        i = int(every.largest.argmax())
-        raise TrajectoryError(
-            f"sensor {source.sensors[i].name!r} reaches {every.largest[i]:g}, too large for "
-            f"float32{''.join(e.where() for e in source.ledger.of('cell', 'kept'))}"
-        )
+        name, largest = source.sensors[every.largest.argmax()].name, every.largest.max()
+        cells = "".join(entry.where() for entry in source.ledger.of("cell", "kept"))
+        raise TrajectoryError(f"sensor {name!r} reaches {largest:g}, too large for float32{cells}")
     blurred = is_coarse(spread, every.largest)
     if blurred.any():
         source.offsets = tuple(np.where(blurred, train.mean, 0.0).tolist())

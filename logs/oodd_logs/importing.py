@@ -61,18 +61,14 @@ _Arrays = dict[str, NDArray[Any] | Blocks]
 Say = Callable[[str], object]
 
 
-def _quiet(_line: str) -> None:
-    pass
-
-
 def import_recipe(
     recipe: Recipe,
     root: Path,
     output: Path | None = None,
     *,
     replace: bool = False,
-    progress: Say = _quiet,
-    report: Say = _quiet,
+    progress: Say = str,
+    report: Say = str,
     ledger: Ledger | None = None,
 ) -> Split:
     """Import logs as a recipe says, as one environment of a split.
@@ -180,9 +176,8 @@ def import_data(
     kinds = in_order((kind for kind in tests if kind != "nominal"), ANOMALIES)
     if test is not None and "nominal" not in tests:
         raise UsageError(
-            f"{str(test)!r} has {', '.join(tests) or 'nothing'}, expected a part 'nominal', too: "
-            "each anomalous episode needs a nominal twin of the same name to be compared with; "
-            "a recipe imports episodes without twins"
+            f"{str(test)!r} has {', '.join(tests) or 'nothing'}, expected a part 'nominal', too, "
+            "with a twin of the same name each; a recipe imports episodes without twins"
         )
     group_of = cast("dict[str, Group]", dict(groups or {}))
     check_known(f"anomaly in {test}", kinds, *group_of)
@@ -366,7 +361,7 @@ def import_frames(
     directory = output or data_home() / recipe.split
     _entries(recipe, directory, replace=replace)
     with make_episodes(recipe, recorded) as source:
-        return _write(recipe, directory, source, replace=replace, progress=_quiet, report=report)
+        return _write(recipe, directory, source, replace=replace, progress=str, report=report)
 
 
 def _entries(recipe: Recipe, directory: Path, *, replace: bool) -> Mapping[str, Any]:
@@ -483,9 +478,8 @@ def _with_twins(source: EpisodeSource, part: str, episodes: Sequence[EpisodeFact
     if unpaired := sorted(by_name.keys() ^ twins.keys()):
         problem = "has no nominal twin" if unpaired[0] in by_name else "is missing"
         raise TrajectoryError(
-            f"{part}: episode {unpaired[0]!r} {problem}, expected the episodes of the twins and no "
-            "others, each under the name of its twin; episodes without twins need a recipe "
-            "without paired = true"
+            f"{part}: episode {unpaired[0]!r} {problem}, expected the names of the twins and no "
+            "others; episodes without twins need a recipe without paired = true"
         )
     ordered = [by_name[name] for name in twins]
     effects = [_effect(source, by_name[name], twin) for name, twin in twins.items()]

@@ -56,12 +56,15 @@ class Recorded:
     roles
         What its file is listed as: ``"files"`` to be shared out, parts such as ``"train"``, and
         ``"test/NAME"`` of anomalies.
+    kind
+        Anomaly that its fields tell; empty where they tell none.
     """
 
     recording: Recording
     path: Path
     relative: str
     roles: frozenset[str]
+    kind: str = ""
 
     @property
     def source(self) -> str:
