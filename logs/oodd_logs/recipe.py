@@ -141,11 +141,8 @@ def _shares(key: str, value: Any) -> tuple[float, ...]:
     shares = value if isinstance(value, list | tuple) else ()
     numbers = all(isinstance(s, int | float) and 0 <= s <= 1 for s in shares)
     if len(shares) not in {2, 3} or not numbers or abs(sum(shares) - 1) > 1e-6 or 0 in shares[:2]:
-        raise wrong_value(
-            key,
-            value,
-            "shares of training, calibration and test with the sum 1, the first two above 0",
-        )
+        expected = "shares of training, calibration and test with the sum 1, the first two above 0"
+        raise wrong_value(key, value, expected)
     return tuple(map(float, shares))
 
 
@@ -437,11 +434,8 @@ class Recipe:
         values["columns"] = {key: values.pop(key) for key in kinds_by_key() if key in values}
         if codes := values["columns"].get(missing_codes.KEY):
             options[missing_codes.KEY] = codes
-        files = {
-            "format": read_text("[read]: format", options.pop("format", "")),
-            "options": options,
-        }
-        recipe = cls(**{"environment": values["split"]} | values | files)
+        values["format"] = read_text("[read]: format", options.pop("format", ""))
+        recipe = cls(**{"environment": values["split"], "options": options} | values)
         recipe.check(source)
         return recipe
 
@@ -477,19 +471,13 @@ class Recipe:
         if not (nominal.files or nominal.train):
             raise UsageError(f"{source}: [nominal] names neither files nor train, expected one")
         if nominal.files and (nominal.train or nominal.calibration):
-            raise UsageError(
-                f"{source}: [nominal] has both files and parts of its own: name either files with "
-                "their shares, or train, calibration and test"
-            )
+            expected = "either files with their shares, or train, calibration and test"
+            raise UsageError(f"{source}: [nominal] has both files and parts, expected {expected}")
         if nominal.train and not nominal.calibration:
-            raise UsageError(
-                f"{source}: [nominal] names train, but no calibration, which thresholds need"
-            )
+            raise UsageError(f"{source}: [nominal] names train, but no calibration for thresholds")
         if self.paired and self.anomalous and not nominal.twins:
-            raise UsageError(
-                f"{source}: paired = true needs [nominal] twins: nominal episodes, each of which "
-                "has the file name of the anomalous one that it is compared with"
-            )
+            expected = "nominal episodes with the file names of the anomalous ones"
+            raise UsageError(f"{source}: paired = true needs [nominal] twins: {expected}")
         for key in ("window", "baseline", "outcome", "kinds", "task"):
             if self.paired and getattr(self, key):
                 raise UsageError(f"{source}: paired = true and {key} exclude each other")

@@ -93,15 +93,13 @@ class TopicRows:
         kept = np.flatnonzero(complete)
         if lacking or (self._policy == "drop" and not len(kept)):
             problem = f"column {lacking[0]!r} has no value" if lacking else "no row has all values"
-            raise TrajectoryError(
-                f"{self._source}: {problem}, expected some: leave the column or the file out"
-            )
+            advice = "expected some: leave the column or the file out"
+            raise TrajectoryError(f"{self._source}: {problem}, {advice}")
         if self._policy != "drop":
             first = self._position = int(firsts.max(initial=0))
             late = self._columns[int(firsts.argmax())] if first else ""
             self._say("row", "dropped", "before the first value", name=late, count=first, row=0)
-            last = self._count - (self._ending() if self._policy == "keep" else 0)
-            return np.arange(first, last)
+            return np.arange(first, self._count - (self._policy == "keep" and self._ending()))
         dropped = np.diff(kept) - 1
         if dropped.max(initial=0) > self._most:
             row = int(kept[int(dropped.argmax())]) + 1
@@ -162,22 +160,20 @@ class TopicRows:
             bad, numbers, name = missing[:, j], np.arange(len(cells)), self._columns[j]
             words = self._words.get(name, np.zeros(len(cells), "U1"))
             is_text, is_inf = words != "", np.isinf(cells[:, j])
-            for reason, which in (
-                ("text among numbers", is_text),
-                ("infinite", is_inf),
-                ("missing", bad & ~is_text & ~is_inf),
-            ):
-                row = int(which.argmax())
+            reasons = {"text among numbers": is_text, "infinite": is_inf}
+            reasons["missing"] = bad & ~is_text & ~is_inf
+            for reason, which in reasons.items():
+                row, count = int(which.argmax()), int(which.sum())
                 cell = str(words[row]) or str(cells[row, j]) * bool(is_inf[row])
-                if self._policy == "refuse" and which.any():
+                if self._policy == "refuse" and count:
                     value = f"{cell!r:.60}" if is_text[row] else cell or reason
                     raise TrajectoryError(
-                        f"{self._source}, row {start + row}, column {name!r} is {value}, "
-                        f"expected a finite number{self._shares.get(name, '')}: missing = 'hold' "
-                        "or 'drop' in a recipe says what to do"
+                        f"{self._source}, row {start + row}, column {name!r} is {value}, expected "
+                        f"a finite number{self._shares.get(name, '')}: missing = 'hold' or 'drop' "
+                        "in a recipe says what to do"
                     )
-                entry: dict[str, Any] = {"row": start + row, "cell": cell}
-                self._say("cell", "held", reason, name=name, count=int(which.sum()), **entry)
+                at: dict[str, Any] = {"name": name, "row": start + row, "cell": cell}
+                self._say("cell", "held", reason, count=count, **at)
             if self._policy == "keep":
                 continue
             held = np.maximum.accumulate(np.where(bad, -1, numbers))
@@ -193,8 +189,7 @@ class TopicRows:
         problem = f"column {column!r} is missing" if column else "values are missing"
         return TrajectoryError(
             f"{self._source}, row {row}: {problem} for at least {rows} rows, expected at most "
-            f"{self._most} in a run: a larger missing_rows allows it, else leave the column or the "
-            "file out"
+            f"{self._most}: a larger missing_rows allows it, else leave the column or file out"
         )
 
     def _cells(self, start: int, stop: int) -> Matrix:
@@ -337,15 +332,13 @@ def _actions(columns: Sequence[ChosenColumn], recipe: Recipe) -> tuple[Quantity,
     if not recipe.discrete or not columns:
         return tuple(column.quantity for column in columns)
     if len(columns) > 1:
-        raise UsageError(
-            f"there are {len(columns)} columns of actions, expected one as actions are discrete"
-        )
+        raise UsageError(f"there are {len(columns)} columns of actions, expected one: discrete")
     if isinstance(recipe.discrete, tuple):
         return tuple(Quantity(name, "1") for name in recipe.discrete)
     if recipe.discrete > _MOST_ACTIONS:
         raise UsageError(
-            f"there are {recipe.discrete} discrete actions, expected at most {_MOST_ACTIONS}, as "
-            "each becomes a column: import them as amounts, without discrete"
+            f"there are {recipe.discrete} discrete actions, expected at most {_MOST_ACTIONS}, each "
+            "a column: import them as amounts, without discrete"
         )
     return tuple(Quantity(f"action {i}", "1") for i in range(recipe.discrete))
 

@@ -11,7 +11,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import chain
+from itertools import chain, product
 from typing import Final
 
 from oodd_eval.data.facts import Quantity
@@ -166,14 +166,14 @@ def respellings(layout: Layout, recipe: Recipe, first: Layout | None) -> dict[tu
     plain = [t.rpartition("=")[2].strip() for t in texts if t and not {*t} & {*"*?"}]
     exact = {text: _exact(layout, text) for text in plain}
     taken = {column for columns in exact.values() for column in columns}
-    for text in (text for text in plain if not exact[text]):
-        for topic, _, _ in layout:
-            name = text.removeprefix(f"{topic}." if topic else "")
-            (bare, unit), old = split_unit(name), spelled(topic, name)
-            if old and (topic, old) not in taken:
-                squared = _in_square(old)
-                new = name if unit else squared.replace(split_unit(squared)[0], bare)
-                names.setdefault((topic, old), new)
+    unfound = (text for text in plain if not exact[text])
+    for text, topic in product(unfound, [topic for topic, _, _ in layout]):
+        name = text.removeprefix(f"{topic}." if topic else "")
+        (bare, unit), old = split_unit(name), spelled(topic, name)
+        if old and (topic, old) not in taken:
+            squared = _in_square(old)
+            new = name if unit else squared.replace(split_unit(squared)[0], bare)
+            names.setdefault((topic, old), new)
     return names
 
 
@@ -393,8 +393,6 @@ def _with_unit(topic: str, column: str, unit: str) -> ChosenColumn:
     name = _aliases(topic, column)[-1]
     recorded_unit = (_named_unit if _PREFIX.match(column) else split_unit)(column)[1]
     if unit not in {"", recorded_unit} and recorded_unit not in {"", "1"}:
-        raise UsageError(
-            f"column {column!r} is in {recorded_unit}, and the recipe says {unit}: values are not "
-            "converted"
-        )
+        problem = f"is in {recorded_unit}, and the recipe says {unit}: values are not converted"
+        raise UsageError(f"column {column!r} {problem}")
     return ChosenColumn(topic, column, Quantity(name, unit or recorded_unit or "1"))

@@ -116,9 +116,7 @@ def check_stamps(times: Times, numbers: NDArray[np.int64], source: str, *, resam
         Whether rows are resampled: then the later of two rows with one stamp holds.
     """
     steps = np.diff(times)
-    wrong = steps < 0 if resampled else steps <= 0
-    if wrong.any():
-        i = int(wrong.argmax())
+    for i in np.flatnonzero(steps < 0 if resampled else steps <= 0)[:1].tolist():
         problem, advice = "as", "rate resamples them"
         if steps[i] < 0:
             problem, advice = "before", "sort the rows, or cut them there with gap in a recipe"
@@ -185,17 +183,15 @@ def cut_at_gaps(
         steps = Steps.of(times)
         most = gap or GAP_STEPS * max(steps.usual, 1 / rate if rate else 0.0) or np.inf
         if gap is None and steps.longest > most:
+            after, usual = times[steps.after] - times[0], f"steps are {steps.usual:g} s"
             raise TrajectoryError(
-                f"{source} has a gap of {steps.longest:g} s after "
-                f"{times[steps.after] - times[0]:g} s{of_topic}, where steps are {steps.usual:g} "
-                f"s: in a recipe, gap = {most:g} cuts the recording at longer gaps, and gap = "
-                f"{steps.longest * 1.01:.3g} takes it as it is"
+                f"{source} has a gap of {steps.longest:g} s after {after:g} s{of_topic}, where "
+                f"{usual}: in a recipe, gap = {most:g} cuts the recording at longer gaps, and gap "
+                f"= {steps.longest * 1.01:.3g} takes it as it is"
             )
         if of_topic and most < steps.usual:
-            raise UsageError(
-                f"{source}: steps{of_topic} are {steps.usual:g} s, expected a gap of more, not "
-                f"{most:g} s"
-            )
+            expected = f"steps{of_topic} are {steps.usual:g} s, expected a gap of more"
+            raise UsageError(f"{source}: {expected}, not {most:g} s")
         cuts = np.flatnonzero(np.diff(times) > most)
         following = np.nextafter(np.append(times[cuts + 1], np.inf), -np.inf)
         ends = np.minimum(times[np.append(cuts, len(times) - 1)] + most, following)
@@ -236,15 +232,12 @@ def on_grid(
     logged = sum(len(times) for times in stamps.values())
     if count > _MOST_ROWS * max(logged, 10):
         raise TrajectoryError(
-            f"{source} lasts {last - first:g} s by its stamps, which makes {count} rows at rate = "
-            f"{rate:g} of {logged} that were logged: is the unit of the stamps right, as in "
-            "time = 'NAME[ms]'?"
+            f"{source} lasts {last - first:g} s by its stamps: {count} rows at rate = {rate:g} of "
+            f"{logged} that were logged: is their unit right, as in time = 'NAME[ms]'?"
         )
     grid, tolerance = first + np.arange(count) / rate, _TOLERANCE / rate
-    sources = {
-        topic: np.searchsorted(times, grid + tolerance, side="right").astype(np.int64) - 1
-        for topic, times in stamps.items()
-    }
+    edges = grid + tolerance
+    sources = {t: np.searchsorted(times, edges, side="right") - 1 for t, times in stamps.items()}
     return Stretch(count, sources, grid, tolerance)
 
 
