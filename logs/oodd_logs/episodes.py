@@ -679,10 +679,8 @@ class _Reading:
         why = ", more than the baseline" if least > 2 else ""
         logged = max(topic.rows for topic in recording.topics.values())
         if rate and logged >= least:
-            why += (
-                f"; {logged} rows were logged: are rate = {rate:g} and the unit of the stamps "
-                "right, as in time = 'NAME[ms]'?"
-            )
+            unit = f"rate = {rate:g} and the unit of the stamps right, as in time = 'NAME[ms]'"
+            why += f"; {logged} rows were logged: are {unit}?"
         problem = f"{counted(rows, 'observation(s)')}, expected at least {least}{why}"
         return TrajectoryError(f"{recording.source} has {problem}")
 
@@ -810,20 +808,17 @@ class _Reading:
             rows = sum(facts.rows for facts in episodes)
             line = f"{part}: {counted(len(episodes), 'episode(s)')}, {counted(rows, 'row(s)')}"
             intervals = [interval for facts in episodes for interval in facts.episode.intervals]
-            if part not in _SHARED and intervals:
-                anomalous = sum(stop - max(start, 0) for start, stop in intervals)
-                line += f", {counted(len(intervals), 'interval(s)')} with "
-                line += counted(anomalous, "anomalous row(s)")
-            elif part not in _SHARED:
-                line += ", known by their outcome alone"
+            marked = counted(sum(b - max(a, 0) for a, b in intervals), "anomalous row(s)")
+            said = f", {counted(len(intervals), 'interval(s)')} with {marked}"
+            said = said if intervals else ", known by their outcome alone"
+            line += "" if part in _SHARED else said
             if episodes or part != TWINS:
                 lines.append(line)
             if part in self.cut_by_outcome:
                 lines.append(
                     f"warning: {part} was cut by window, and nothing says which rows are "
-                    "anomalous: every window counts as anomalous, also those before the fault. "
-                    "Name the anomalous rows (labels, intervals, or onset, which is 0 where the "
-                    "fault is there from the first row on), or leave out window"
+                    "anomalous: every window counts, also before the fault. Name the rows (labels, "
+                    "intervals, or onset, 0 for a fault from the first row on), or leave out window"
                 )
         if recipe.nominal.files:
             how = "in the order of their stamps" if self.by_stamps else "in the order of files"
@@ -832,15 +827,12 @@ class _Reading:
         if self.steps and source.rate is None:
             steps = self._all_steps()
             shortest, longest = min(s.shortest for s in steps), max(s.longest for s in steps)
-            lines.append(
-                f"rows are {shortest:g} to {longest:g} s apart and taken as they are: rate in the "
-                "recipe resamples them"
-            )
+            apart = f"rows are {shortest:g} to {longest:g} s apart and taken as they are"
+            lines.append(f"{apart}: rate in the recipe resamples them")
         if self.first and (choices := self.first.spool.converter.choices):
-            lines.append(
-                f"actions are whole numbers from 0 to {choices - 1}: if they are choices, "
-                f"discrete = {choices} (--discrete {choices}) makes each a column"
-            )
+            advice = f"discrete = {choices} (--discrete {choices}) makes each a column"
+            numbers = f"actions are whole numbers from 0 to {choices - 1}"
+            lines.append(f"{numbers}: if they are choices, {advice}")
         return lines
 
 

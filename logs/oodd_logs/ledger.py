@@ -56,10 +56,9 @@ class LedgerEntry:
     @property
     def first(self) -> str:
         """The first place in words, such as ``r03.csv row 60 "#N/A"``."""
-        parts = [next(iter(self.sources), "")]
-        parts += [] if self.row is None else [f"row {self.row}"]
-        parts += [f'"{self.cell}"'] if self.cell else []
-        return " ".join(filter(None, parts))
+        row = "" if self.row is None else f"row {self.row}"
+        cell = f'"{self.cell}"' if self.cell else ""
+        return " ".join(filter(None, [next(iter(self.sources), ""), row, cell]))
 
     def where(self, total: int = 0) -> str:
         """Return in how many sources it is, and in which, the first with its place.
@@ -89,12 +88,8 @@ class LedgerEntry:
 
     def as_json(self) -> dict[str, Any]:
         """Return the entry as values for JSON."""
-        return {
-            "item": self.item,
-            "fate": self.fate,
-            "name": self.name,
-            "reason": self.reason,
-            "count": self.count,
+        keys = ("item", "fate", "name", "reason", "count")
+        return {key: getattr(self, key) for key in keys} | {
             "sources": len(self.sources),
             "first": {"source": next(iter(self.sources), ""), "row": self.row, "cell": self.cell},
             "examples": [*self.sources][:_EXAMPLES],
@@ -184,7 +179,11 @@ class Ledger:
 
     def complete(self, other: Self) -> None:
         """Add what another ledger has of things, or of their sources, and this one has not."""
-        things = {_thing(entry): entry for entry in self}
+
+        def thing(entry: LedgerEntry) -> tuple[str, ...]:
+            return (entry.item, entry.name, "" if entry.item == "column" else entry.reason)
+
+        things = {thing(entry): entry for entry in self}
         gone = {source for entry in self.of("file", "dropped") for source in entry.sources}
         for key, entry in other._entries.items():
             if entry.item in {"file", "recording"} and entry.fate == "dropped":
@@ -192,7 +191,7 @@ class Ledger:
                 entry.count = entry.sources.total()
             if not entry.count:
                 continue
-            mine = things.get(_thing(entry))
+            mine = things.get(thing(entry))
             if mine is None:
                 self._entries[key] = entry
             elif entry.item != "column":
@@ -225,10 +224,6 @@ class Ledger:
     def as_json(self) -> list[dict[str, Any]]:
         """Return the entries as values for JSON."""
         return [entry.as_json() for entry in self]
-
-
-def _thing(entry: LedgerEntry) -> tuple[str, ...]:
-    return (entry.item, entry.name, "" if entry.item == "column" else entry.reason)
 
 
 def _some(texts: Sequence[str]) -> str:

@@ -108,9 +108,8 @@ def _write(
             content = f"{anomalies} in intervals of rows"
             further = ", anomaly, intervals as JSON (a start of -1 is unknown, none: outcome alone)"
         source = f"trajectories of a fixed policy ({policy}), from"
-        if data.logs:
-            source = "episodes of logs, as imported into"
-            further = f", name, task{further}"
+        source = "episodes of logs, as imported into" if data.logs else source
+        further = f", name, task{further}" if data.logs else further
         infinity = float("inf")
         # Commands of the benchmark's robots are shares of a motor's power; others may be anything.
         bound = 1.0 if data.id in ENVIRONMENTS else infinity

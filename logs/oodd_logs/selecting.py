@@ -24,7 +24,7 @@ from oodd_logs.recording import Column, Recording, Topic
 _PREFIX: Final = re.compile(r"\s*(obs|action)\s*:\s*(?=\S)", re.IGNORECASE)
 _UNIT: Final = re.compile(r"(.*?[^\[\]\s])\s*\[\s*([^\[\]]*[^\[\]\s])\s*\]")
 _SYMBOL: Final = r"(?:[numkMGµμ]?(?:Nm|Hz|Pa|bar|rad|[msgNAVWJlL])|°[CF]?|degC?|rpm|rev|min|[hKC%])"
-_ROUND: Final = re.compile(rf"\s*\(({_SYMBOL}(?:[ */.·^-]?(?:{_SYMBOL}|\d))*)\)\s*$")
+_ROUND: Final = re.compile(rf"\s*\(((?:1/)?{_SYMBOL}(?:[ */.·^-]?(?:{_SYMBOL}|\d))*)\)\s*$")
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +169,7 @@ def respellings(layout: Layout, recipe: Recipe, first: Layout | None) -> dict[tu
     unfound = (text for text in plain if not exact[text])
     for text, topic in product(unfound, [topic for topic, _, _ in layout]):
         name = text.removeprefix(f"{topic}." if topic else "")
-        (bare, unit), old = split_unit(name), spelled(topic, name)
+        (bare, unit), old = split_unit(_in_square(name)), spelled(topic, name)
         if old and (topic, old) not in taken:
             squared = _in_square(old)
             new = name if unit else squared.replace(split_unit(squared)[0], bare)

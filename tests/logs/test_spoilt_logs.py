@@ -138,7 +138,9 @@ def spelling(rng, log):
         f"{bare[0]}\N{ZERO WIDTH SPACE}{bare[1:]}",
         bare.translate({ord(c): ord(c) + 0xFEE0 for c in "abcdefghijklmnopqrstuvwxyz"}),
     )
-    _rename(log, name, spellings[rng.integers(len(spellings))] + bracket + unit_of_it)
+    spelled = [spelling + bracket + unit_of_it for spelling in spellings]
+    spelled += [f"{bare} ({unit_of_it.removesuffix(']')})"] * bool(bracket)
+    _rename(log, name, spelled[rng.integers(len(spelled))])
 
 
 def unit(rng, log):
