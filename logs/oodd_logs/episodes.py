@@ -41,7 +41,6 @@ from oodd_logs.recorded import FILES, NOMINAL_ROLES, SLOWER, Recorded, StampedRo
 from oodd_logs.recording import Recording
 from oodd_logs.rows import Converter, Spool
 from oodd_logs.selecting import (
-    ChosenColumn,
     Layout,
     Selection,
     layout_of,
@@ -309,26 +308,6 @@ def read_every_episode(recipe: Recipe, root: Path, files: Sequence[Path]) -> Epi
     return reading.episodes(reading.recordings_of(roles))
 
 
-def matching_files(patterns: Sequence[str], root: Path) -> list[Path]:
-    """Return the files, or directories of data sets, that globs match, in natural order.
-
-    Raises
-    ------
-    UsageError
-        When none of the globs matches anything.
-    """
-    names = [name for pattern in patterns for name in names_matching(pattern, root)]
-    if patterns and not names:
-        there = sorted(path.name for path in root.iterdir())[:20] if root.is_dir() else []
-        raise UsageError(
-            f"{' and '.join(map(repr, patterns))} match{'es' * (len(patterns) == 1)} no file in "
-            f"{str(root)!r}, which holds {', '.join(there) or 'nothing'}; --root DIR is the folder "
-            "that files of a recipe are relative to"
-        )
-    files = dict.fromkeys(root / name for name in names)
-    return sorted(files, key=lambda path: natural_order(path.as_posix()))
-
-
 def names_matching(pattern: str, root: Path) -> list[str]:
     """Return the names of files that a glob matches.
 
@@ -412,12 +391,21 @@ class _Reading:
         tables = {FILES: nominal.files, TRAIN: nominal.train, CALIBRATION: nominal.calibration}
         tables[TWINS] = (*nominal.test, *nominal.twins)
         anomalous = {f"test/{name}": table.files for name, table in self.recipe.anomalous.items()}
-        absent = [pattern for pattern in self.recipe.globs if not names_matching(pattern, root)]
+        matches = {pattern: names_matching(pattern, root) for pattern in self.recipe.globs}
+        absent = [pattern for pattern, names in matches.items() if not names]
         # Who has a part of a set lacks files of some anomalies; where all lack, that is an error.
         there = {role: patterns for role, patterns in anomalous.items() if {*patterns} - {*absent}}
         roles: dict[Path, set[str]] = {}
         for role, patterns in (tables | (there or anomalous)).items():
-            for path in matching_files(patterns, root):
+            paths = {root / name for pattern in patterns for name in matches[pattern]}
+            if patterns and not paths:
+                names = sorted(path.name for path in root.iterdir())[:20] if root.is_dir() else []
+                raise UsageError(
+                    f"{' and '.join(map(repr, patterns))} match{'es' * (len(patterns) == 1)} no "
+                    f"file in {str(root)!r}, which holds {', '.join(names) or 'nothing'}; --root "
+                    "DIR is the folder that files of a recipe are relative to"
+                )
+            for path in paths:
                 roles.setdefault(path, set()).add(role)
         for pattern in absent:
             self.ledger.add("file", "dropped", "no file matches", name=pattern)
@@ -547,7 +535,8 @@ class _Reading:
                     raise
                 raise TrajectoryError(f"{error}; {self.first.source} has it") from None
             except UsageError as error:
-                raise UsageError(f"{source}: {str(error).removeprefix(source)}") from None
+                problem = str(error).removeprefix(source).lstrip(": ")
+                raise UsageError(f"{source}: {problem}") from None
             if self.first is None:
                 if discrete and not recipe.discrete:
                     names = tuple(map(str, recording.fields.get("choices", ())))
@@ -841,7 +830,7 @@ def _in_order(selection: Selection, first: _First, source: str) -> Selection:
     # Globs may match further columns in later files: these are unused.
     if selection == first.selection:
         return selection
-    ordered: dict[str, tuple[ChosenColumn, ...]] = {}
+    ordered: dict[str, Any] = {}
     unused = selection.unused
     for kind in ("sensors", "actions"):
         expected = [column.quantity for column in getattr(first.selection, kind)]

@@ -5,7 +5,6 @@ Libraries are told apart by what their objects offer, so that none of them is ne
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,7 +17,7 @@ from oodd_logs.readers import library
 from oodd_logs.recipe import Recipe
 from oodd_logs.recorded import FILES, Recorded
 from oodd_logs.recording import Column, Recording, Topic
-from oodd_logs.selecting import layout_of, unnamed_columns
+from oodd_logs.selecting import with_sensors
 
 _FORMS: Final = (
     "a data frame, an array of shape (rows, columns), a pair of arrays, a mapping of columns or a "
@@ -73,9 +72,7 @@ def scanned_frames(episodes: Sequence[Any], sensors: Sequence[Any]) -> EpisodeSo
         for title, recording in recordings_of("episode ", episodes)
     ]
     names = tuple(str(getattr(sensor, "name", sensor)) for sensor in sensors)
-    recipe = Recipe("frames", "frames", sensors=names)
-    if not names:
-        recipe = replace(recipe, sensors=unnamed_columns(layout_of(recorded[0].recording), recipe))
+    recipe = with_sensors(Recipe("frames", "frames", sensors=names), recorded[0].recording)
     return make_episodes(recipe, recorded, every=True)
 
 

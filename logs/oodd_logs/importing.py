@@ -33,21 +33,14 @@ from oodd_eval.data.parts import CALIBRATION, TRAIN, TWINS
 from oodd_eval.data.split import Split, data_home
 from oodd_eval.errors import TrajectoryError, UnknownNameError, UsageError
 from oodd_eval.names import check_known
-from oodd_logs.episodes import (
-    EpisodeFacts,
-    EpisodeSource,
-    files_of,
-    make_episodes,
-    matching_files,
-    read_episodes,
-)
+from oodd_logs.episodes import EpisodeFacts, EpisodeSource, files_of, make_episodes, read_episodes
 from oodd_logs.ledger import Ledger
 from oodd_logs.marks import read_intervals
 from oodd_logs.readers import readers
 from oodd_logs.recipe import AnomalousFiles, Interval, NominalFiles, Recipe
 from oodd_logs.recorded import Recorded
-from oodd_logs.selecting import layout_of, select_columns, unnamed_columns
-from oodd_logs.splitting import recordings_in, split_recording
+from oodd_logs.selecting import with_sensors
+from oodd_logs.splitting import split_recording
 
 ONSETS: Final = "onsets.csv"
 """File beside those of a part that names their onsets."""
@@ -70,6 +63,7 @@ def import_recipe(
     progress: Say = str,
     report: Say = str,
     ledger: Ledger | None = None,
+    names: Mapping[str, Sequence[Quantity]] | None = None,
 ) -> Split:
     """Import logs as a recipe says, as one environment of a split.
 
@@ -91,6 +85,8 @@ def import_recipe(
         Called with each line of what was read and what was left out.
     ledger
         Takes all that was left out, held or changed.
+    names
+        Names and units in place of the files' own, of ``"sensors"`` and ``"actions"``.
 
     Returns
     -------
@@ -111,6 +107,9 @@ def import_recipe(
         refuse_inputs(directory / name, files_of(recipe, root), "the split's file")
     with read_episodes(recipe, root) as source:
         (Ledger() if ledger is None else ledger).merge(source.ledger)
+        for kind, quantities in (names or {}).items():
+            if quantities:
+                _name(source, kind, quantities)
         say = {"progress": progress, "report": report}
         return _write(recipe, directory, source, replace=replace, **say)
 
@@ -128,7 +127,6 @@ def import_data(
     discrete: int = 0,
     groups: Mapping[str, str] | None = None,
     output: Path | None = None,
-    replace: bool = False,
     **say: Any,
 ) -> Split:
     """Import parts in one format, of which test episodes have twins: a recipe in short.
@@ -155,8 +153,8 @@ def import_data(
         Groups of anomalies that the benchmark does not know, by default ``"dynamics"``.
     output
         Directory of the split, by default where splits are found.
-    replace, **say
-        As for `import_recipe`.
+    **say
+        ``replace`` and others of `import_recipe`.
 
     Returns
     -------
@@ -193,9 +191,8 @@ def import_data(
     keys: dict[str, Any] = {"nominal": nominal, "anomalous": anomalous, "intervals": intervals}
     recipe = dataclasses.replace(recipe, **keys)
     recipe.check()
-    if sensors or actions:
-        recipe = _with_names(recipe, sensors, actions)
-    return import_recipe(recipe, Path(), output, replace=replace, **say)
+    names = {"sensors": sensors, "actions": actions}
+    return import_recipe(recipe, Path(), output, names=names, **say)
 
 
 def _files_of(form: str, part: Path) -> tuple[str, ...]:
@@ -246,31 +243,14 @@ def _onsets(parts: Iterable[Path]) -> Iterator[Interval]:
             yield str(there[name]), start, stop, kind
 
 
-def _with_names(recipe: Recipe, sensors: Sequence[Quantity], actions: Sequence[Quantity]) -> Recipe:
-    """Return a recipe that gives the columns of the first episode some names."""
-    path = matching_files(recipe.nominal.train, Path())[0]
-    recording = next(recordings_in(path, recipe), None)
-    if recording is None:
-        raise UsageError(f"{path} has no episodes, expected at least one")
-    selection = select_columns(layout_of(recording), recipe, recording.source)
-    keys: dict[str, Any] = {"reward": selection.reward.column if selection.reward else ""}
-    for kind, new in (("sensors", sensors), ("actions", actions)):
-        columns = getattr(selection, kind)
-        names = tuple(quantity.name for quantity in new)
-        choices = recipe.discrete or recording.fields.get("discrete", 0)
-        is_discrete = kind == "actions" and bool(names and choices)
-        count = int(cast("int", choices)) if is_discrete else len(columns)
-        if names and (len(names) != count or len({*names}) < len(names)):
-            raise UsageError(
-                f"there are {count} {kind}, named {', '.join(names)}: expected as many different "
-                f"names (--{kind})"
-            )
-        if is_discrete:
-            keys["discrete"] = names
-        quantities = new if names and not is_discrete else [c.quantity for c in columns]
-        pairs = zip(quantities, columns, strict=True)
-        keys[kind] = tuple(f"{q.name}[{q.unit}]={c.column}" for q, c in pairs)
-    return dataclasses.replace(recipe, **keys)
+def _name(source: EpisodeSource, kind: str, quantities: Sequence[Quantity]) -> None:
+    """Give the sensors or actions some names; `UsageError` where these are not as many."""
+    count, names = len(getattr(source, kind)), [quantity.name for quantity in quantities]
+    if len(names) != count or len({*names}) < count:
+        named = f"there are {count} {kind}, named {', '.join(names)}"
+        raise UsageError(f"{named}: expected as many different names (--{kind})")
+    is_discrete = kind == "actions" and source.discrete
+    setattr(source, kind, tuple(Quantity(q.name, "1") if is_discrete else q for q in quantities))
 
 
 def import_frames(
@@ -355,9 +335,8 @@ def import_frames(
         for title, table in recordings_of(f"{part}-", episodes, next(iter(recipe.time), ""))
         for recording in split_recording(table, recipe.episode)
     ]
-    if not recipe.sensors and recorded:
-        layout_ = layout_of(recorded[0].recording)
-        recipe = dataclasses.replace(recipe, sensors=unnamed_columns(layout_, recipe))
+    if recorded:
+        recipe = with_sensors(recipe, recorded[0].recording)
     directory = output or data_home() / recipe.split
     _entries(recipe, directory, replace=replace)
     with make_episodes(recipe, recorded) as source:

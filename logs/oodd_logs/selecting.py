@@ -278,15 +278,17 @@ def _texts_of(recipe: Recipe) -> list[str]:
     return [*recipe.label_columns, *filter(None, keys)]
 
 
-def unnamed_columns(layout: Layout, recipe: Recipe) -> tuple[str, ...]:
-    """Return the columns that no key of a recipe without sensors names; none with ``obs:`` ones."""
-    columns = _pairs(layout)
-    if any((match := _PREFIX.match(name)) and match[1].lower() == "obs" for _, name in columns):
-        return ()
+def with_sensors(recipe: Recipe, recording: Recording) -> Recipe:
+    """Return a recipe whose sensors, without any or ``obs:`` ones, are what no key names."""
+    layout = layout_of(recording)
+    matches = [_PREFIX.match(name) for _, name in _pairs(layout)]
+    if recipe.sensors or "obs" in {match[1].lower() for match in matches if match}:
+        return recipe
     texts = [*recipe.actions, *_texts_of(recipe), *recipe.time, *filter(None, [recipe.reward])]
     named = {(c.topic, c.column) for text in texts for c in find_columns(layout, text)}
-    unnamed = (column for column in columns if column not in named)
-    return tuple(f"{topic}.{name}" if topic else name for topic, name in unnamed)
+    unnamed = (pair for pair in _pairs(layout) if pair not in named)
+    sensors = tuple(f"{topic}.{name}" if topic else name for topic, name in unnamed)
+    return dataclasses.replace(recipe, sensors=sensors)
 
 
 def _by_prefix(layout: Layout, source: str) -> dict[str, list[ChosenColumn]]:
