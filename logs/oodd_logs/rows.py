@@ -262,10 +262,9 @@ class Converter:
         self.sensors = tuple(quantity for part in self._parts for quantity in part.outputs)
         for sensor in self.sensors:
             if sensor.role == "angle" and sensor.unit in FULL_TURN:
-                raise UsageError(
-                    f"roles: the angle {sensor.name!r} is in {sensor.unit}, expected rad; list it "
-                    "under angles, too, to replace it by sine and cosine"
-                )
+                expected = "rad; list it under angles, too, to replace it by sine and cosine"
+                problem = f"the angle {sensor.name!r} is in {sensor.unit}, expected {expected}"
+                raise UsageError(f"roles: {problem}")
         self._start = start
         self.actions = _actions(selection.actions, recipe)
         self.discrete = bool(recipe.discrete)
@@ -316,15 +315,14 @@ class Converter:
 
 def _with_roles(sensors: Sequence[Quantity], recipe: Recipe) -> list[Quantity]:
     """Return sensors with the roles that a recipe names, one each."""
-    named: dict[int, list[str]] = {}
+    named: dict[int, str] = {}
     for role, patterns in recipe.roles.items():
         for i in matching(patterns, sensors, f"sensor whose role is {role}"):
-            named.setdefault(i, []).append(role)
-    for i, roles in named.items():
-        if len(roles) > 1:
-            name = sensors[i].name
-            raise UsageError(f"roles: {name!r} is {' and '.join(roles)}, expected one role")
-    return [replace(q, role=cast("Role", named.get(i, [q.role])[0])) for i, q in enumerate(sensors)]
+            if i in named:
+                roles = f"{named[i]} and {role}"
+                raise UsageError(f"roles: {sensors[i].name!r} is {roles}, expected one role")
+            named[i] = role
+    return [replace(q, role=cast("Role", named.get(i, q.role))) for i, q in enumerate(sensors)]
 
 
 def _actions(columns: Sequence[ChosenColumn], recipe: Recipe) -> tuple[Quantity, ...]:

@@ -336,26 +336,23 @@ def _times(
     layout: Layout, topics: Iterable[str], texts: Sequence[str], source: str
 ) -> dict[str, tuple[ChosenColumn, ...]]:
     """Return the columns with stamps by topic, as the recipe names them, else as the format."""
-    stamps: dict[str, list[ChosenColumn]] = defaultdict(list)
-    for text in texts:
-        columns = {column.topic: column for column in find_columns(layout, text)}
-        for topic, names, _ in layout:
+    times: dict[str, tuple[ChosenColumn, ...]] = {}
+    unmatched = set(texts)
+    for topic, names, time in layout:
+        columns: list[ChosenColumn] = []
+        for text in texts:
             # One name holds for all topics.
-            for column in find_columns((("", names, ""),), text):
-                columns.setdefault(topic, dataclasses.replace(column, topic=topic))
-        if not columns:
-            name = split_unit(text)[0]
-            raise UnknownNameError(f"column of {source}", name, named_columns(layout))
-        for topic, column in columns.items():
-            stamps[topic].append(column)
-    times: dict[str, tuple[ChosenColumn, ...]] = {
-        topic: (ChosenColumn(topic, time, Quantity(time, "s")),)
-        for topic, _, time in layout
-        if time
-    }
-    times |= {
-        topic: tuple(columns) for topic, columns in stamps.items() if len(columns) == len(texts)
-    }
+            below = f"{topic}.{text}" if topic else text
+            matches = (find_columns(((topic, names, time),), name) for name in (text, below))
+            for column in next(filter(None, matches), [])[-1:]:
+                columns.append(column)
+                unmatched.discard(text)
+        if texts and len(columns) == len(texts):
+            times[topic] = tuple(columns)
+        elif time:
+            times[topic] = (ChosenColumn(topic, time, Quantity(time, "s")),)
+    for text in (text for text in texts if text in unmatched):
+        raise UnknownNameError(f"column of {source}", split_unit(text)[0], named_columns(layout))
     if texts and (without := [topic for topic in topics if topic not in times]):
         absent = " and ".join(map(repr, texts))
         raise TrajectoryError(f"{source}: topic {without[0]!r} has no column {absent}, its stamps")

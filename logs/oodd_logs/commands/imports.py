@@ -83,9 +83,8 @@ def import_logs(options: Options) -> int:
     shipped = None if keys else shipped_recipes().get(options.name)
     if options.name.endswith(".toml") or shipped:
         if keys:
-            raise UsageError(
-                f"--{next(iter(keys))} is said by the recipe {options.name}: write it there"
-            )
+            option = f"--{next(iter(keys))}"
+            raise UsageError(f"{option} is said by the recipe {options.name}: write it there")
         if shipped and not options.root:
             raise UsageError(f"--root is missing: the folder with the files of {options.name}")
         path = shipped or Path(options.name)
@@ -98,10 +97,10 @@ def import_logs(options: Options) -> int:
         split = import_recipe(recipe, root, **say)
     else:
         if lacking := [name for name in _REQUIRED if name not in keys]:
+            required = ", ".join(f"--{name}" for name in _REQUIRED)
             raise UsageError(
                 f"{options.name!r} is no recipe (FILE.toml, or {', '.join(shipped_recipes())}), "
-                f"and --{lacking[0]} is missing: expected "
-                f"{', '.join(f'--{name}' for name in _REQUIRED)} without one"
+                f"and --{lacking[0]} is missing: expected {required} without one"
             )
         if options.root:
             raise UsageError("--root is the folder of a recipe's files, expected FILE.toml with it")
@@ -118,8 +117,6 @@ def import_logs(options: Options) -> int:
         tested = len(data.twins) + len(data.anomalies)
     if tested:
         name = split.path if options.output else split.name
-        arguments = ["--env", environment, "--split", str(name)]
-        notes.print(
-            f"Evaluate detectors: oodd-eval run --detector {_DETECTORS} {shlex.join(arguments)}"
-        )
+        arguments = shlex.join(["--env", environment, "--split", str(name)])
+        notes.print(f"Evaluate detectors: oodd-eval run --detector {_DETECTORS} {arguments}")
     return 0

@@ -50,12 +50,8 @@ def inspect(options: Options) -> int:
     if options.recipe and options.recipe.exists():
         raise OutputError(f"{str(options.recipe)!r} exists: remove it, or choose another name")
     refuse_logs([options.recipe, options.json], options.path, options.format)
-    logs = inspect_logs(
-        options.path,
-        options.format or "",
-        dict(options.read),
-        lambda file: console.print(file) if options.verbosity > 0 else None,
-    )
+    files = make_console(quiet=options.verbosity < 1)
+    logs = inspect_logs(options.path, options.format or "", dict(options.read), files.print)
     console.print(describe_logs(logs, console.width))
     if options.json:
         write_text(options.json, json.dumps(as_json(logs), indent=2) + "\n")
@@ -75,9 +71,8 @@ def inspect(options: Options) -> int:
     prefix = root.relative_to(home).as_posix() if below else ""
     write_text(options.recipe, draft(logs, prefix, options.recipe.stem))
     arguments = [str(options.recipe), *([] if below else ["--root", str(folder)])]
-    console.print(
-        f"Read and edit it, then: {shlex.join(['oodd-eval', 'data', 'import', *arguments])}"
-    )
+    command = shlex.join(["oodd-eval", "data", "import", *arguments])
+    console.print(f"Read and edit it, then: {command}")
     return 0
 
 
