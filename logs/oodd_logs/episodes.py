@@ -153,19 +153,24 @@ class EpisodeSource:
         Subtracted from each sensor; empty where nothing is.
     """
 
-    sensors: tuple[Quantity, ...]
-    actions: tuple[Quantity, ...]
-    discrete: bool
-    rewards: bool
     _spool: Spool
-    _kept: tuple[int, ...]
-    rate: float | None = None
-    parts: dict[str, list[EpisodeFacts]] = field(default_factory=dict)
+    rewards: bool
+    rate: float | None
+    parts: dict[str, list[EpisodeFacts]]
+    ledger: Ledger
+    recordings: int
+    sensors: tuple[Quantity, ...] = ()
+    actions: tuple[Quantity, ...] = ()
+    discrete: bool = False
     groups: dict[str, Group] = field(default_factory=dict)
-    ledger: Ledger = field(default_factory=Ledger)
-    recordings: int = 0
     notes: list[str] = field(default_factory=list)
     offsets: tuple[float, ...] = ()
+    _kept: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        rows = self._spool.converter
+        self.sensors, self.actions, self.discrete = rows.sensors, rows.actions, rows.discrete
+        self._kept = tuple(range(rows.width))
 
     def __enter__(self) -> Self:
         return self
@@ -751,19 +756,10 @@ class _Reading:
                 if not median / SLOWER < step < median * SLOWER:
                     reason = f"a row every {step:g} s, where others have one every {median:g} s"
                     self.ledger.add("recording", "kept", reason, source=label)
-        converter = self.first.spool.converter
-        source = EpisodeSource(
-            converter.sensors,
-            converter.actions,
-            converter.discrete,
-            self.first.selection.reward is not None,
-            self.first.spool,
-            tuple(range(converter.width)),
-            self.recipe.rate or even_rate(self._all_steps()),
-            parts,
-            ledger=self.ledger,
-            recordings=self.recordings + len(self.failures),
-        )
+        rate, ledger = self.recipe.rate or even_rate(self._all_steps()), self.ledger
+        has_rewards, count = self.first.selection.reward is not None, self.recordings
+        count += len(self.failures)
+        source = EpisodeSource(self.first.spool, has_rewards, rate, parts, ledger, count)
         _say_far(source)
         return source
 

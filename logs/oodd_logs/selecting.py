@@ -164,7 +164,7 @@ def respellings(layout: Layout, recipe: Recipe, first: Layout | None) -> dict[tu
     names = {(topic, old): name for topic, name, old in pairs if old}
     texts = (*_texts_of(recipe), *recipe.sensors, *recipe.actions, recipe.reward, *recipe.time)
     plain = [t.rpartition("=")[2].strip() for t in texts if t and not {*t} & {*"*?"}]
-    exact = {text: _exact(layout, text) for text in plain}
+    exact = {text: _matches(layout, text)[0] for text in plain}
     taken = {column for columns in exact.values() for column in columns}
     unfound = (text for text in plain if not exact[text])
     for text, topic in product(unfound, [topic for topic, _, _ in layout]):
@@ -175,16 +175,6 @@ def respellings(layout: Layout, recipe: Recipe, first: Layout | None) -> dict[tu
             new = name if unit else squared.replace(split_unit(squared)[0], bare)
             names.setdefault((topic, old), new)
     return names
-
-
-def _exact(layout: Layout, text: str) -> list[tuple[str, str]]:
-    """Return the columns that a text names as it is written; those of another unit, too."""
-    glob = pattern_of(split_unit(text)[0])
-    return [
-        (topic, name)
-        for topic, name in _pairs(layout)
-        if text in (aliases := _aliases(topic, name)) or any(map(glob.fullmatch, aliases))
-    ]
 
 
 def respelled(recording: Recording, names: Mapping[tuple[str, str], str]) -> Recording:
@@ -213,14 +203,16 @@ def find_columns(layout: Layout, text: str) -> list[ChosenColumn]:
         When a renamed column is not exactly one, or the file has another unit.
     """
     new, equals, pattern = text.partition("=")
-    columns = _matches(layout, text)
-    if not columns and equals:
-        columns = _matches(layout, pattern)
-        if len(columns) > 1:
-            raise UsageError(f"{text!r} renames {len(columns)} columns, expected exactly one")
-        name, unit = _named_unit(new)
-        for c in columns:
-            return [ChosenColumn(c.topic, c.column, Quantity(name, unit or c.quantity.unit))]
+    pairs, unit = _matches(layout, text)
+    name, new_unit = "", ""
+    if not pairs and equals:
+        (pairs, unit), (name, new_unit) = _matches(layout, pattern), _named_unit(new)
+        if len(pairs) > 1:
+            raise UsageError(f"{text!r} renames {len(pairs)} columns, expected exactly one")
+    columns = [_with_unit(topic, column, unit) for topic, column in pairs]
+    for c in columns if name else []:
+        quantity = Quantity(name, new_unit or c.quantity.unit)
+        return [dataclasses.replace(c, quantity=quantity)]
     return columns
 
 
@@ -374,18 +366,17 @@ def _aliases(topic: str, column: str) -> list[str]:
     return [*dict.fromkeys(prefix + alias.strip() for alias in (column, bare, name))]
 
 
-def _matches(layout: Layout, text: str) -> list[ChosenColumn]:
-    """Return the columns that a glob without a new name matches, with the unit it names."""
+def _matches(layout: Layout, text: str) -> tuple[list[tuple[str, str]], str]:
+    """Return the columns that a glob without a new name matches, and the unit it names."""
     stripped = text.strip()
     readings = [(stripped, ""), split_unit(stripped)]
     if {*stripped} & {*"*?"}:  # columns with the unit and without it
         readings.reverse()
     for pattern, unit in dict.fromkeys([*readings, _named_unit(stripped)]):
         glob = pattern_of(pattern)
-        matches = [pair for pair in _pairs(layout) if any(map(glob.fullmatch, _aliases(*pair)))]
-        if matches:
-            return [_with_unit(topic, name, unit) for topic, name in matches]
-    return []
+        if pairs := [p for p in _pairs(layout) if any(map(glob.fullmatch, _aliases(*p)))]:
+            return pairs, unit
+    return [], ""
 
 
 def _with_unit(topic: str, column: str, unit: str) -> ChosenColumn:
