@@ -248,15 +248,15 @@ def is_transposed(path: Path, options: Options) -> bool:
 
     The option ``transpose`` is true, or a list of globs over the names of files.
     """
-    value = options.get("transpose", False)
-    if isinstance(value, bool):
-        return value
-    if isinstance(value, list) and all(isinstance(glob, str) for glob in value):
-        return any(fnmatch.fnmatch(path.name, glob) or path.match(glob) for glob in value)
-    raise UsageError(f"transpose is {value!r}, expected true, false or a list of globs")
+    expected = "true, false or a list of globs"
+    value = option(
+        options, "transpose", False, lambda v: isinstance(v, bool) or are_texts(v), expected
+    )
+    globs = ["*"] if value is True else value or []
+    return any(fnmatch.fnmatch(path.name, glob) or path.match(glob) for glob in globs)
 
 
-def chosen(names: Iterable[str], options: Options, option: str = "topics") -> list[str]:
+def chosen(names: Iterable[str], options: Options, name: str = "topics") -> list[str]:
     """Return the names that an option selects, a glob or a list of globs; all without it.
 
     Raises
@@ -264,16 +264,30 @@ def chosen(names: Iterable[str], options: Options, option: str = "topics") -> li
     UsageError
         When a glob fits none.
     """
-    available, globs = [*names], options.get(option)
-    if globs is None:
-        return available
+    available = [*names]
+    globs = option(
+        options, name, ["*"], lambda v: isinstance(v, str) or are_texts(v), "a list of globs"
+    )
     globs = [globs] if isinstance(globs, str) else globs
-    if not isinstance(globs, list) or not all(isinstance(glob, str) for glob in globs):
-        raise UsageError(f"{option}={globs!r:.80}, expected a list of globs")
     for glob in globs:
-        if not fnmatch.filter(available, glob):
-            raise UnknownNameError(option.removesuffix("s"), glob, available)
+        if available and not fnmatch.filter(available, glob):
+            raise UnknownNameError(name.removesuffix("s"), glob, available)
     return [name for name in available if any(fnmatch.fnmatch(name, glob) for glob in globs)]
+
+
+def option(
+    options: Options, name: str, default: Any, fits: Callable[[Any], Any], expected: str
+) -> Any:
+    """Return the value of an option; `UsageError` where it is not what is expected."""
+    value = options.get(name, default)
+    if not fits(value):
+        raise UsageError(f"[read] {name} = {value!r:.80}, expected {expected}")
+    return value
+
+
+def are_texts(value: Any) -> bool:
+    """Tell whether a value is a list of texts."""
+    return isinstance(value, list) and all(isinstance(text, str) for text in value)
 
 
 def _guarded(topic: Topic, recording: Recording) -> Topic:

@@ -9,7 +9,7 @@ import csv
 import io
 import itertools
 import re
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, TextIO
@@ -21,8 +21,8 @@ from oodd_eval.errors import TrajectoryError, UsageError
 from oodd_logs.kinds import read_texts
 from oodd_logs.kinds.number_marks import MARKS, has_thousands, may_have_thousands, without_marks
 from oodd_logs.ledger import Ledger
-from oodd_logs.readers import TRANSPOSE, Options, is_transposed
-from oodd_logs.readers.cells import check_width, column_names, number, numbers, texts
+from oodd_logs.readers import TRANSPOSE, Options, are_texts, is_transposed, option
+from oodd_logs.readers.cells import check_width, column_names, numbers, texts
 from oodd_logs.readers.packed import open_bytes, open_text, read_text, stem
 from oodd_logs.recording import Column, Recording, Topic
 
@@ -87,10 +87,6 @@ class Layout:
     units: tuple[str, ...] = ()
     header: tuple[str, ...] = ()
 
-    def split(self, lines: Sequence[str]) -> list[list[str]]:
-        """Return the cells of lines; lines without any are left out."""
-        return _split(lines, self.separator)
-
 
 def table_recording(path: Path, options: Options, separator: str = "") -> Recording:
     """Return a file as a recording with one topic.
@@ -113,84 +109,80 @@ def table_recording(path: Path, options: Options, separator: str = "") -> Record
     """
     ledger = Ledger()
     if is_transposed(path, options):
-        topic = _transposed(path, options, separator)
-    else:
-        layout = layout_of(path, options, separator)
-        topic = Topic.of(_table(path, layout, ledger))
-        for name in {*topic.names} - {*layout.header}:
-            if (match := re.fullmatch(r"(.+) \(\d+\)", name)) and layout.header.count(match[1]) > 1:
-                ledger.add(
-                    "column", "changed", f"{match[1]!r} stands twice in the header", name=name
-                )
-        if layout.units:
-            said = f"units of the columns, it seems: {', '.join(layout.units)}"[:200]
-            ledger.add("row", "changed", f"{said} ([read] units = false keeps the line as a row)")
+        return Recording(stem(path), str(path), {"": _transposed(path, options, separator)})
+    layout = layout_of(path, options, separator)
+    topic = Topic.of(_table(path, layout, ledger))
+    for name in topic.names:
+        plain = re.sub(r" \(\d+\)$", "", name)
+        if name not in layout.header and layout.header.count(plain) > 1:
+            ledger.add("column", "changed", f"{plain!r} stands twice in the header", name=name)
+    if layout.units:
+        said = f"units of the columns, it seems: {', '.join(layout.units)}"[:200]
+        ledger.add("row", "changed", f"{said} ([read] units = false keeps the line as a row)")
     return Recording(stem(path), str(path), {"": topic}, ledger=ledger)
 
 
 def _table(path: Path, layout: Layout, ledger: Ledger) -> dict[str, Column]:
     """Return the columns of a file, and say what became of its cells."""
-    every, notes = range(len(layout.names)), Ledger()
+    every = range(len(layout.names))
     worded = {*every} if layout.thousands else set[int]()
-    blocks = _columns(path, layout, worded, notes)
-    worded = {i for i in every for block in blocks if isinstance(block[i], list)}
-    if layout.thousands is None and layout.separator != ",":
-        joined = {i: np.concatenate([b[i] for b in blocks]) for i in every if i not in worded}
-        worded |= {i for i, column in joined.items() if may_have_thousands(column)}
-    if any(not isinstance(block[i], list) for block in blocks for i in worded):
+    while True:
+        notes, size = Ledger(), 0
+        blocks: list[list[_Cells]] = []
+        for block in _blocks(path, layout, notes):
+            blocks.append(block.columns(worded))
+            size += 8 * len(every) * len(blocks[-1][0])
+            if size > 4 * EPISODE.most:
+                problem = f"{path} has more than {4 * EPISODE.most} bytes of numbers"
+                raise EPISODE.failure(f"{problem}, write it as Parquet or")
+        worded = {i for i in every for block in blocks if isinstance(block[i], list)}
+        plain = {i: np.concatenate([[], *(b[i] for b in blocks)]) for i in every if i not in worded}
+        if layout.thousands is None and layout.separator != ",":
+            worded |= {i for i, column in plain.items() if may_have_thousands(column)}
         # One text, however late, makes texts of all cells of its column.
-        notes = Ledger()
-        blocks = _columns(path, layout, worded, notes)
+        if all(isinstance(block[i], list) for block in blocks for i in worded):
+            break
     ledger.merge(notes)
     columns: dict[str, Column] = {}
     for i, name in enumerate(layout.names):
-        parts: list[Any] = [block[i] for block in blocks]
         if i in worded:
-            cells = [*itertools.chain(*parts)]
+            cells = [*itertools.chain(*(block[i] for block in blocks))]
             column = _column(cells, name, layout, ledger)
             columns[name] = texts(cells, f"{path}, column {name!r}") if column is None else column
-        else:
-            column = np.concatenate([np.empty(0), *parts])
-            if name != f"column {i + 1}" or not len(column) or not np.isnan(column).all():
-                columns[name] = column
+        elif name != f"column {i + 1}" or not len(plain[i]) or not np.isnan(plain[i]).all():
+            columns[name] = plain[i]
     return columns
 
 
 def _column(cells: list[str], name: str, layout: Layout, ledger: Ledger) -> Column | None:
     """Return the numbers of a column in which not all cells are plain ones; None for texts."""
-    decimal, marks = layout.decimal, [layout.thousands] if layout.thousands else []
+    decimal, marks = layout.decimal, [layout.thousands or ""]
     if layout.thousands is None:
         said = {mark: has_thousands(cells, mark, decimal) for mark in ".,"}
         marks = [mark for mark in said if said[mark] and mark != layout.separator]
-        if unsure := [mark for mark, verdict in said.items() if verdict is None]:
-            reason = (
-                f"{unsure[0]!r} before three digits may stand between thousands: [read] thousands"
-            )
+        for mark in [mark for mark, verdict in said.items() if verdict is None][:1]:
+            reason = f"{mark!r} before three digits may stand between thousands: [read] thousands"
             ledger.add("column", "kept", reason, name=name)
-    for mark in marks:
+    for mark in filter(None, marks):
         other = "," if mark == "." else decimal if decimal not in {"", mark} else "."
         column = numbers([without_marks(cell, mark, other) for cell in cells], other)
-        row = next((i for i, cell in enumerate(cells) if without_marks(cell, mark) != cell), None)
-        if column is not None and row is not None:
-            reason = f"{mark!r} stands between thousands"
-            ledger.add("column", "changed", reason, name=name, row=row, cell=cells[row])
         if column is not None:
+            reason = f"{mark!r} stands between thousands"
+            rows = [i for i, cell in enumerate(cells) if without_marks(cell, mark) != cell]
+            for row in rows[:1]:
+                ledger.add("column", "changed", reason, name=name, row=row, cell=cells[row])
             return column
     column = numbers(cells, decimal)
-    if column is not None:
-        absent = np.flatnonzero(np.isnan(column)).tolist()
-        coded = [row for row in absent if numbers([cells[row]], strict=True) is None]
-        for code in dict.fromkeys(cells[row] for row in coded):
-            rows = [row for row in coded if cells[row] == code]
-            place: dict[str, Any] = {"count": len(rows), "row": rows[0], "cell": code}
-            ledger.add("cell", "changed", "a code for what is missing", name=name, **place)
+    for row in np.flatnonzero(np.isnan(column)).tolist() if column is not None else ():
+        if numbers([cells[row]], strict=True) is None:
+            reason = "a code for what is missing"
+            ledger.add("cell", "changed", reason, name=name, row=row, cell=cells[row])
     return column
 
 
 def _transposed(path: Path, options: Options, separator: str) -> Topic:
     """Return a file as a topic of which each line is a column, perhaps with its name in front."""
-    encoding = _encoding(path, options)
-    lines = read_text(path, encoding).splitlines()[_whole(options, "skip") :]
+    lines = read_text(path, _encoding(path, options)).splitlines()[_skipped(options) :]
     lines = [line for line in lines if line.strip() and not line.startswith("#")]
     mark = _separator(lines[:_SAMPLE], options, separator)
     decimal = _decimal(_split(lines[:_SAMPLE], mark), mark, options)
@@ -202,72 +194,68 @@ def _transposed(path: Path, options: Options, separator: str) -> Topic:
         values = cells[labelled:]
         column = numbers(values, decimal)
         columns.append(texts(values, f"{path}, line {line}") if column is None else column)
-    names = _names(options, labels, len(labels), path)
-    if len({*map(len, columns)}) > 1:
-        counts = sorted({*map(len, columns)})
+    counts = sorted({*map(len, columns)})
+    if len(counts) > 1:
         raise TrajectoryError(f"{path}: lines have from {counts[0]} to {counts[-1]} cells")
-    return Topic.of(dict(zip(names, columns, strict=True)))
+    return Topic.of(dict(zip(_names(options, labels, path), columns, strict=True)))
 
 
 def layout_of(path: Path, options: Options, separator: str = "") -> Layout:
     """Return the layout of a file, recognised from its first lines as far as options leave it."""
     encoding = _encoding(path, options)
+    raw: list[str] = []
     with open_text(path, encoding) as text:
-        raw = []
-        for line in iter(lambda: _line(text, path), ""):
+        for line in itertools.islice(iter(lambda: _line(text, path), ""), _SAMPLE):
             raw.append(_without_zeros(line, Ledger()))
-            if len(raw) == _SAMPLE or sum(map(len, raw)) > LINE_CHARACTERS:
+            if sum(map(len, raw)) > LINE_CHARACTERS:
                 break
-    first = _whole(options, "skip")
-    if len(raw) > first and (mark := re.fullmatch(r'"?sep=(.)"?\s*', raw[first])):
+    first = _skipped(options)
+    if mark := re.fullmatch(r'"?sep=(.)"?\s*', "".join(raw[first : first + 1])):
         separator, first = mark[1], first + 1  # as Excel writes it
     while first < len(raw) and (raw[first].startswith("#") or not raw[first].strip()):
         first += 1
-    comment = next((line for line in raw[first - 1 :: -1] if line.strip()), "") if first else ""
+    comment = next(filter(str.strip, reversed(raw[:first])), "")
     lines = raw[first:]
-    mark_of_cells = _separator(lines, options, separator)
-    rows = _split(lines, mark_of_cells)
+    separator = _separator(lines, options, separator)
+    rows = _split(lines, separator)
     if not rows:
         raise TrajectoryError(f"{path} is empty, expected a line with names of columns, and rows")
-    decimal = _decimal(rows, mark_of_cells, options)
+    decimal = _decimal(rows, separator, options)
     head = rows[0]
     # A row of values has numbers, and perhaps times, and nothing else.
     words = [cell for cell in head if numbers([cell], decimal, strict=True) is None]
     is_data = len(words) < len(head) and all(map(_DATE.match, words)) and any(map(str.strip, head))
-    header = options.get("header", not is_data)
-    if not isinstance(header, bool):
-        raise UsageError(f"header is {header!r}, expected true or false")
+    header = option(options, "header", not is_data, lambda v: isinstance(v, bool), "true or false")
     names: Sequence[str] = [*map(str, range(len(head)))]
     units: list[str] = []
     if header:
-        names = head
-        if options.get("units", True) is not False:
-            units = _units(rows, decimal)
-        first += _line_of("".join(lines), 1 if units else 0, mark_of_cells)
-        if units:
-            names = [_with_unit(n, u) for n, u in itertools.zip_longest(head, units, fillvalue="")]
+        units = _units(rows, decimal) if options.get("units", True) is not False else []
+        names = [_with_unit(n, u) for n, u in itertools.zip_longest(head, units, fillvalue="")]
+        first += _line_of("".join(lines), 1 if units else 0, separator)
+        if re.match(r"[#%]\s", names[0]):
+            names = [names[0][1:], *names[1:]]
+            if not names[0].strip() and [len(row) for row in rows[1:2]] == [len(names) - 1]:
+                names = names[1:]
     elif comment.startswith(("#", "%")) and "header" not in options:
-        above = _split([comment[1:].lstrip()], mark_of_cells)[0]
+        above = _split([comment[1:].lstrip()], separator)[0]
         names = above if len(above) == len(head) else names
-    if header and re.match(r"[#%]\s", names[0]):
-        names = [names[0][1:], *names[1:]]
-        if not names[0].strip() and [len(row) for row in rows[1:2]] == [len(names) - 1]:
-            names = names[1:]
     check_width(path, len(names))
-    labels = _names(options, names, len(names), path)
-    thousands = _thousands(options, mark_of_cells)
+    marks = [mark for mark in (None, False, *MARKS) if mark != separator]
+    expected = f"one of {', '.join(map(repr, MARKS))} that is no separator, or false"
+    thousands = option(options, "thousands", None, marks.__contains__, expected)
     if thousands and decimal in {thousands, ""}:
         decimal = "," if thousands == "." else "."
-    written = tuple(cell.strip() for cell in head) if header else ()
-    return Layout(mark_of_cells, decimal, encoding, first, labels, thousands, tuple(units), written)
-
-
-def _thousands(options: Options, separator: str) -> str | None:
-    thousands = options.get("thousands")
-    if thousands not in {None, False, *MARKS} or (thousands and thousands == separator):
-        expected = f"one of {', '.join(map(repr, MARKS))} that is no separator, or false"
-        raise UsageError(f"thousands is {thousands!r}, expected {expected}")
-    return "" if thousands is False else thousands
+    written = tuple(map(str.strip, head)) if header else ()
+    return Layout(
+        separator,
+        decimal,
+        encoding,
+        first,
+        _names(options, names, path),
+        "" if thousands is False else thousands,
+        tuple(units),
+        written,
+    )
 
 
 def _units(rows: Sequence[Sequence[str]], decimal: str) -> list[str]:
@@ -294,21 +282,6 @@ def _with_unit(name: str, unit: str) -> str:
     return name if "[" in name or plain in {"", "-", "1"} or "[" in plain else f"{name}[{plain}]"
 
 
-def _columns(
-    path: Path, layout: Layout, worded: Collection[int], ledger: Ledger
-) -> list[list[_Cells]]:
-    """Return the columns of each block: numbers where all of its cells are, and not `worded`."""
-    blocks, size = [], 0
-    for block in _blocks(path, layout, ledger):
-        columns = block.columns(worded)
-        size += 8 * len(columns) * len(columns[0])
-        if size > 4 * EPISODE.most:
-            problem = f"{path} has more than {4 * EPISODE.most} bytes of numbers"
-            raise EPISODE.failure(f"{problem}, write it as Parquet or")
-        blocks.append(columns)
-    return blocks
-
-
 def _blocks(path: Path, layout: Layout, ledger: Ledger) -> Iterator["_Block"]:
     with open_text(path, layout.encoding) as file:
         for _ in range(line := layout.lines):
@@ -324,9 +297,16 @@ def _blocks(path: Path, layout: Layout, ledger: Ledger) -> Iterator["_Block"]:
             # A line may end within quotes.
             while text.count('"') % 2 and len(text) < extra and (more := file.readline(2**16)):
                 text += more
-            if text:
-                yield _Block(path, layout, _without_zeros(text, ledger), line, last, ledger)
-            line += text.count("\n")
+            text = _without_zeros(text, ledger)
+            # The last row may lack cells: nothing is commanded after the last observation.
+            end = len(text.rstrip(f"\r\n {layout.separator}")) if last else 0
+            start = text.rfind("\n", 0, end) + 1 if last else len(text)
+            if not text[:start].strip() or (last and text.count('"', 0, start) % 2):
+                start = 0 if last else start
+            for part, is_last in ((text[:start], False), (text[start:], last)):
+                if part:
+                    yield _Block(path, layout, part, line, is_last, ledger)
+                line += part.count("\n")
 
 
 def _line(file: TextIO, path: Path) -> str:
@@ -372,103 +352,76 @@ class _Block:
 
     def columns(self, worded: Collection[int]) -> list[_Cells]:
         """Return the cells of each column: numbers where all are, and not `worded`, else texts."""
-        fast = None if worded else self._numbers()
-        if fast is not None:
-            return fast
+        layout, width = self.layout, len(self.layout.names)
+        if not worded and not self.last and (block := self._numbers()) is not None:
+            return block
         lines = io.StringIO(self.text).readlines()
-        rows = self.layout.split(lines)
+        rows = _split(lines, layout.separator)
         if self.last:
             while rows and not any(rows[-1]):
                 rows.pop()
-            if rows and self._is_cut(rows[-1]):
-                cell = self.layout.separator.join(rows.pop())
+            # A row that is cut ends where it stands, and lacks more than commands.
+            lacking = layout.names[len(rows[-1]) :] if rows else ()
+            if not self.text.endswith("\n") and any(not n.startswith(_LAST) for n in lacking):
+                cell = layout.separator.join(rows.pop())
                 self.ledger.add("row", "dropped", "the last line is cut", cell=cell)
-        width = len(self.layout.names)
         if '"' in self.text and any("\n" in cell for row in rows for cell in row):
-            plain = [
-                line.rstrip("\r\n").split(self.layout.separator) for line in lines if line.strip()
-            ]
+            plain = [line.rstrip("\r\n").split(layout.separator) for line in lines if line.strip()]
             if {*map(len, plain)} == {width}:
                 rows = plain
                 self.ledger.add("row", "changed", "a quote that is never closed stands for itself")
-        pairs = enumerate(rows)
-        rows = [
-            self._fitted(row, i, self.last and i == len(rows) - 1)
-            for i, row in pairs
-            if not self._is_remark(row, i)
-        ]
+        rows = [row for i, row in enumerate(rows) if self._is_kept(row, i)]
+        for i, row in enumerate(rows):
+            if len(row) != width:
+                rows[i] = self._fitted(row, i, self.last and i == len(rows) - 1)
         columns: list[_Cells] = []
         for i, cells in enumerate(zip(*rows, strict=True)):
-            column = None if i in worded else numbers(cells, self.layout.decimal, strict=True)
+            column = None if i in worded else numbers(cells, layout.decimal, strict=True)
             columns.append([*cells] if column is None else column)
-        return columns or [np.empty(0) for _ in range(width)]
+        return columns or [[] if i in worded else np.empty(0) for i in range(width)]
 
     def _numbers(self) -> list[_Cells] | None:
-        """Return the columns of a block where every cell but the last row's is a plain number."""
-        # Rows of that kind are most there are, and NumPy reads them in half of the time. The last
-        # row may lack cells: nothing is commanded after the last observation.
-        source = self.text.rstrip("\n")
-        body, _, end = source.rpartition("\n")
-        layout, width = self.layout, len(self.layout.names)
+        """Return the columns of a block in which every cell is a plain number."""
+        # Blocks of that kind are most there are, and NumPy reads them in half of the time.
+        comma, separator = self.layout.decimal == ",", self.layout.separator
+        text = self.text.replace(".", "?").replace(",", ".") if comma else self.text
+        mark = None if separator == BLANKS else separator
         try:
-            (row,) = layout.split([end])
-            if self.last and self._is_cut(row):
-                return None
-            cells = [number(cell, layout.decimal) for cell in row + [""] * (width - len(row))]
-            is_filled = len(row) == width and not np.isnan(cells).any()
-            source = source if is_filled else body
-            if layout.decimal == ",":
-                source = source.replace(".", "?").replace(",", ".")
-            mark = None if layout.separator == BLANKS else layout.separator
-            block = np.empty((0, width))
-            if source:
-                lines = source.split("\n")
-                block = np.loadtxt(lines, delimiter=mark, comments=None, quotechar='"', ndmin=2)
+            lines = text.split("\n")
+            block = np.loadtxt(lines, delimiter=mark, comments=None, quotechar='"', ndmin=2)
         except ValueError:
             return None
-        if not any(row) or len(cells) != width or block.shape[1] != width:
-            return None
-        return [*(block if is_filled else np.concatenate([block, [cells]])).T]
+        return [*block.T] if block.shape[1] == len(self.layout.names) else None
 
-    def _is_cut(self, row: list[str]) -> bool:
-        """Tell whether the last row ends where it stands, and lacks more than commands."""
-        lacking = self.layout.names[len(row) :]
-        ended = self.text.endswith("\n") or all(n.startswith(_LAST) for n in lacking)
-        return not ended
-
-    def _is_remark(self, row: list[str], i: int) -> bool:
-        """Tell whether a row is a remark between rows, or the header again; note it."""
-        header, reason = self.layout.header, ""
-        cells = [cell.strip() for cell in row] if row[0].strip() in header else []
+    def _is_kept(self, row: list[str], i: int) -> bool:
+        """Tell whether a row is no remark between rows, nor the header again; note it."""
+        header = self.layout.header
         if len(row) != len(self.layout.names) and row[0].startswith(("#", "%")):
             reason = "a remark between rows"
-        elif header and cells == [*header]:
+        elif row[0].strip() in header and sorted(map(str.strip, row)) == sorted(header):
             reason = "the header again"
-        elif len(header) > 1 and sorted(cells) == sorted(header):
-            line = self.line + _line_of(self.text, i, self.layout.separator)
-            raise TrajectoryError(
-                f"{self.path}, line {line} is a header of another order: split it"
-            )
-        if reason:
-            self.ledger.add("row", "dropped", reason, cell=self.layout.separator.join(row))
-        return bool(reason)
+            if tuple(map(str.strip, row)) != header:
+                raise TrajectoryError(f"{self._place(i)} is a header of another order: split it")
+        else:
+            return True
+        self.ledger.add("row", "dropped", reason, cell=self.layout.separator.join(row))
+        return False
 
     def _fitted(self, row: list[str], i: int, end: bool) -> list[str]:
         """Return a row with as many cells as the header; empty cells may be missing at the end."""
         names = self.layout.names
         width = len(names)
-        if len(row) == width:
-            return row
         needed = max((k for k, n in enumerate(names, 1) if n != f"column {k}"), default=width)
         if len(row) < width and (end or len(row) >= needed):
             return row + [""] * (width - len(row))
         if len(row) > width and not any(row[width:]):
             return row[:width]
-        number_of_line = self.line + _line_of(self.text, i, self.layout.separator)
-        raise TrajectoryError(
-            f"{self.path}, line {number_of_line} has {len(row)} cells, expected {width}: "
-            f"{', '.join(names)}"[:600]
-        )
+        problem = f"{self._place(i)} has {len(row)} cells, expected {width}: {', '.join(names)}"
+        raise TrajectoryError(problem[:600])
+
+    def _place(self, i: int) -> str:
+        line = self.line + _line_of(self.text, i, self.layout.separator)
+        return f"{self.path}, line {line}"
 
 
 def _encoding(path: Path, options: Options) -> str:
@@ -489,34 +442,36 @@ def _encoding(path: Path, options: Options) -> str:
     return "utf-8-sig" if head.startswith(b"\xef\xbb\xbf") else str(encoding)
 
 
-def _split(lines: Sequence[str], separator: str) -> list[list[str]]:
+def _split(lines: Iterable[str], separator: str) -> list[list[str]]:
+    """Return the cells of lines that have any."""
+    return [cells for _, cells in _numbered(lines, separator)]
+
+
+def _numbered(lines: Iterable[str], separator: str) -> Iterator[tuple[int, list[str]]]:
+    """Yield the number of the line on which a row ends, from 1 on, and its cells."""
     if separator == BLANKS:
-        return [cells for line in lines if (cells := line.split())]
-    rows = csv.reader(lines, delimiter=separator, skipinitialspace=True)
-    return [row for row in rows if row and (len(row) > 1 or row[0].strip())]
+        yield from ((i, cells) for i, line in enumerate(lines, 1) if (cells := line.split()))
+        return
+    reader = csv.reader(lines, delimiter=separator, skipinitialspace=True)
+    for row in reader:
+        if len(row) > 1 or (row and row[0].strip()):
+            yield reader.line_num, row
 
 
 def _line_of(text: str, i: int, separator: str) -> int:
     """Return the number of the line on which row `i` of a text ends, from 1 on."""
-    lines = io.StringIO(text).readlines()
-    if separator == BLANKS:
-        return [n for n, line in enumerate(lines, start=1) if line.split()][i]
-    reader = csv.reader(lines, delimiter=separator, skipinitialspace=True)
-    filled = (row for row in reader if row and (len(row) > 1 or row[0].strip()))
-    next(itertools.islice(filled, i, None))
-    return reader.line_num
+    return next(itertools.islice(_numbered(io.StringIO(text), separator), i, None))[0]
 
 
 def _separator(lines: Sequence[str], options: Options, default: str) -> str:
     """Return the separator of the options, of the format, or the first that fits the lines."""
-    separator = options.get("separator", default)
-    if separator == "\\t":
-        return "\t"
-    if separator:
-        if not isinstance(separator, str) or len(separator) != 1 or separator in '"\n\r':
-            expected = "one character, such as ';'"
-            raise UsageError(f"separator is {separator!r}, expected {expected}")
-        return separator
+    if options.get("separator", default):
+        one = re.compile(r'[^"\n\r]|\\t').fullmatch
+        expected = "one character, such as ';'"
+        mark = option(
+            options, "separator", default, lambda v: isinstance(v, str) and one(v), expected
+        )
+        return "\t" if mark == "\\t" else str(mark)
     sample = [line for line in lines if line.strip()]
     for candidate in (c for c in ("\t", ";", "|", ",", BLANKS) if sample and c in sample[0]):
         counts = [len(row) for row in _split(sample, candidate)]
@@ -526,11 +481,10 @@ def _separator(lines: Sequence[str], options: Options, default: str) -> str:
 
 
 def _decimal(rows: Sequence[Sequence[str]], separator: str, options: Options) -> str:
-    decimal = options.get("decimal")
-    if decimal is not None:
-        if decimal not in {".", ","} or decimal == separator:
-            raise UsageError(f"decimal is {decimal!r}, expected '.' or ',', and no separator")
-        return str(decimal)
+    if "decimal" in options:
+        expected = "'.' or ',', and no separator"
+        marks = [mark for mark in ".," if mark != separator]
+        return str(option(options, "decimal", "", marks.__contains__, expected))
     if separator == ",":
         return "."
     # A mark before three digits may stand between thousands.
@@ -540,23 +494,17 @@ def _decimal(rows: Sequence[Sequence[str]], separator: str, options: Options) ->
     return "." if points else "," if commas else ""
 
 
-def _names(options: Options, names: Sequence[str], count: int, path: Path) -> tuple[str, ...]:
-    option_names = options.get("names")
-    if option_names is None:
-        return column_names(names)
-    if not isinstance(option_names, list) or not all(
-        isinstance(name, str) for name in option_names
-    ):
-        raise UsageError(f"names are {option_names!r}, expected a list of texts")
-    if len(option_names) != count:
+def _names(options: Options, names: Sequence[str], path: Path) -> tuple[str, ...]:
+    labels = option(options, "names", [*names], are_texts, "a list of texts")
+    if len(labels) != len(names):
         raise UsageError(
-            f"{path} has {count} columns, expected {len(option_names)} as there are names"
+            f"{path} has {len(names)} columns, expected {len(labels)} as there are names"
         )
-    return column_names(option_names)
+    return column_names(labels)
 
 
-def _whole(options: Options, name: str) -> int:
-    value = options.get(name, 0)
-    if type(value) is not int or value < 0:
-        raise UsageError(f"{name} is {value!r}, expected a whole number from 0 on")
-    return value
+def _skipped(options: Options) -> int:
+    def is_whole(value: Any) -> bool:
+        return type(value) is int and value >= 0
+
+    return int(option(options, "skip", 0, is_whole, "a whole number from 0 on"))
