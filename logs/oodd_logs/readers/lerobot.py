@@ -15,7 +15,7 @@ from oodd_eval.data.bounded import EPISODE, read_bytes, read_json
 from oodd_eval.errors import TrajectoryError
 from oodd_eval.names import natural
 from oodd_logs.ledger import Ledger
-from oodd_logs.readers import Options, Reader, in_order, library, unreadable
+from oodd_logs.readers import Options, Reader, in_order, library, readable
 from oodd_logs.readers.cells import column_names
 from oodd_logs.readers.parquet import ParquetRows
 from oodd_logs.recording import Column, Recording, Topic
@@ -26,6 +26,8 @@ _COUNTERS: Final = ("episode_index", "index", "task_index", "frame_index")
 _DATA_PATH: Final = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 
 Facts = Mapping[str, Any]
+_Part = tuple[str, str, ParquetRows, tuple[int, int], Facts, str]
+"""Name and source of an episode, its file and rows there, what its table says, and otherwise."""
 
 
 def _open(directory: Path, _options: Options) -> Iterator[Recording]:
@@ -36,63 +38,68 @@ def _open(directory: Path, _options: Options) -> Iterator[Recording]:
     fps = facts.get("fps")
     if not isinstance(fps, int | float) or not 0 < fps < 1e9:
         raise TrajectoryError(f"{info}: fps is {fps!r}, expected rows a second")
-    episodes = sorted(directory.glob("meta/episodes/**/*.parquet"))
-    if episodes:
-        yield from _version_3(directory, facts, episodes)
-        return
-    files = [
-        *directory.glob("data/chunk-*/episode_*.parquet"),
-        *directory.glob("episode_*.parquet"),
-    ]
-    tasks = _lines(info.with_name("tasks.jsonl"), "task_index")
-    entries = _lines(info.with_name("episodes.jsonl"), "episode_index")
+    tables = sorted(directory.glob("meta/episodes/**/*.parquet"))
+    tasks = _by_number(info.with_name(f"tasks.{'parquet' if tables else 'jsonl'}"), "task_index")
+    parts = _version_3(directory, facts, tables) if tables else _version_2(directory, info)
+    for name, source, rows, span, entry, note in parts:
+        recording = _episode(name, source, rows, span, facts)
+        fields = recording.fields
+        task = tasks.get(fields.get("task_index", -1), {})
+        text = task.get("task", task.get("__index_level_0__")) or entry.get("tasks")
+        if isinstance(text, list | tuple):
+            text = text[0] if len(text) == 1 else None
+        if isinstance(text, str):
+            fields["task"] = text
+        if note:
+            reason = "rows are those that the data has, not those of the table of episodes"
+            recording.ledger.add("recording", "changed", reason, cell=note)
+        yield recording
+
+
+def _version_2(directory: Path, info: Path) -> Iterator[_Part]:
+    """Yield the parts of a data set with a file an episode."""
+    globs = ("data/chunk-*/episode_*.parquet", "episode_*.parquet")
+    files = [path for glob in globs for path in directory.glob(glob)]
+    entries = _by_number(info.with_name("episodes.jsonl"), "episode_index")
     for path in sorted(files, key=lambda path: in_order(path.stem)):
         rows = ParquetRows(path, ["*"])
-        number = path.stem.removeprefix("episode_")
-        more = entries.get(natural(number), {})
-        length = more.get("length", rows.rows)
+        entry = entries.get(natural(path.stem.removeprefix("episode_")), {})
+        length = entry.get("length", rows.rows)
         note = "" if length == rows.rows else f"{length}, but {rows.rows}"
-        yield _episode(path.stem, str(path), rows, (0, rows.rows), facts, tasks, more, note)
+        yield path.stem, str(path), rows, (0, rows.rows), entry, note
 
 
-def _version_3(directory: Path, facts: Facts, episodes: Sequence[Path]) -> Iterator[Recording]:
-    """Yield episodes of files that hold several each.
+def _version_3(directory: Path, facts: Facts, tables: Sequence[Path]) -> Iterator[_Part]:
+    """Yield the parts of a data set with several episodes a file.
 
     The table of episodes says where. Where the rows themselves number their episodes, they do.
     """
-    tasks = _tasks(directory / "meta" / "tasks.parquet")
     pattern = str(facts.get("data_path", _DATA_PATH))
-    files: dict[tuple[int, int], tuple[ParquetRows, int, dict[int, tuple[int, int]]]] = {}
-    for table in episodes:
-        for entry in _entries(table):
-            try:
-                key = int(entry["data/chunk_index"]), int(entry["data/file_index"])
-                low, high = int(entry["dataset_from_index"]), int(entry["dataset_to_index"])
-                number = int(entry["episode_index"])
-                relative = pattern.format(chunk_index=key[0], file_index=key[1])
-            except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-                raise unreadable(table, error) from error
+    path: Path | None = None
+    for table, entry in ((path, entry) for path in tables for entry in _rows(path)):
+        with readable(table):
+            chunk, file = int(entry["data/chunk_index"]), int(entry["data/file_index"])
+            low, high = int(entry["dataset_from_index"]), int(entry["dataset_to_index"])
+            number = int(entry["episode_index"])
+            relative = pattern.format(chunk_index=chunk, file_index=file)
+        if not (directory / relative).resolve().is_relative_to(directory.resolve()):
+            raise TrajectoryError(f"{table}: {relative!r} is outside the data set")
+        if path != directory / relative:
             path = directory / relative
-            if not path.resolve().is_relative_to(directory.resolve()):
-                raise TrajectoryError(f"{table}: {relative!r} is outside the data set")
-            if key not in files:
-                rows = ParquetRows(path, ["*"])
-                # Rows are numbered through all files.
-                first = int(rows.read(["index"], 0, 1)["index"][0]) if rows.rows else 0
-                files = {key: (rows, first, _spans(rows))}
-            rows, first, spans = files[key]
-            start, stop = low - first, high - first
-            counted = spans.get(number, (start, stop) if not spans else (0, 0))
-            if not 0 <= counted[0] < counted[1] <= rows.rows:
-                raise TrajectoryError(
-                    f"{table}: episode {number} is rows {start} to {stop} of {path}, which has "
-                    f"{rows.rows}, of the episodes {sorted(spans)[:20]}"
-                )
-            wrong = f"{start} to {stop}, but {counted[0]} to {counted[1]}"
-            note = "" if counted == (start, stop) else wrong
-            source = f"{path}, episode {number}"
-            name = f"episode_{number:06d}"
-            yield _episode(name, source, rows, counted, facts, tasks, entry, note)
+            rows = ParquetRows(path, ["*"])
+            # Rows are numbered through all files.
+            first = int(rows.read(["index"], 0, 1)["index"][0]) if rows.rows else 0
+            spans = _spans(rows)
+        start, stop = low - first, high - first
+        counted = spans.get(number, (start, stop) if not spans else (0, 0))
+        if not 0 <= counted[0] < counted[1] <= rows.rows:
+            raise TrajectoryError(
+                f"{table}: episode {number} is rows {start} to {stop} of {path}, which has "
+                f"{rows.rows}, of the episodes {sorted(spans)[:20]}"
+            )
+        wrong = f"{start} to {stop}, but {counted[0]} to {counted[1]}"
+        note = "" if counted == (start, stop) else wrong
+        yield f"episode_{number:06d}", f"{path}, episode {number}", rows, counted, entry, note
 
 
 def _spans(rows: ParquetRows) -> dict[int, tuple[int, int]]:
@@ -109,51 +116,34 @@ def _spans(rows: ParquetRows) -> dict[int, tuple[int, int]]:
 
 
 def _episode(
-    name: str,
-    source: str,
-    rows: ParquetRows,
-    span: tuple[int, int],
-    facts: Facts,
-    tasks: Mapping[int, Facts],
-    more: Facts,
-    note: str,
+    name: str, source: str, rows: ParquetRows, span: tuple[int, int], facts: Facts
 ) -> Recording:
-    """Return an episode; `span` is its rows in the file, `note` what its table says otherwise."""
+    """Return an episode; `span` is its rows in the file."""
     columns = _columns(rows.names, facts, source)
     first, count = span[0], span[1] - span[0]
     counters = [n for n in ("episode_index", "task_index") if n in rows.names and count]
-    head = rows.read(counters, first, first + 1) if counters else {}
+    head = rows.read(counters, first, first + 1)
     fields: dict[str, Any] = {counter: int(head[counter][0]) for counter in counters}
-    task = tasks.get(fields.get("task_index", -1), {}).get("task") or more.get("tasks")
-    if isinstance(task, list | tuple):
-        task = task[0] if len(task) == 1 else None
-    if isinstance(task, str):
-        fields["task"] = task
     success = next((c for c in ("next.success", "success", "is_success") if c in rows.names), None)
     if success and count:
         fields["success"] = bool(np.nanmax(rows.read([success], first, span[1])[success]) > 0)
     time = next((label for label, inner in columns.items() if inner == _TIME), "time")
-    names = tuple(dict.fromkeys([*columns, time]))
 
     def read(labels: Sequence[str], start: int, stop: int) -> dict[str, Column]:
         inner = [columns[label] for label in labels if label in columns]
-        cells = rows.read(inner, first + start, first + stop) if inner else {}
+        cells = rows.read(inner, first + start, first + stop)
         table = {}
         for label in labels:
-            if label in columns:
-                table[label] = cells[columns[label]]
-            else:
-                table[label] = np.arange(start, stop) / float(facts["fps"])
-            if stop == count and (label.startswith("action:") or label == "reward"):
-                table[label] = np.append(table[label][:-1], np.nan)
+            known = label in columns
+            cell = cells[columns[label]] if known else np.arange(start, stop) / facts["fps"]
+            lacks_last = stop == count and (label.startswith("action:") or label == "reward")
+            table[label] = np.append(cell[:-1], np.nan) if lacks_last else cell
         return table
 
     ledger = Ledger()
     ledger.merge(rows.ledger)
-    if note:
-        reason = "rows are those that the data has, not those of the table of episodes"
-        ledger.add("recording", "changed", reason, cell=note)
-    return Recording(name, source, {"": Topic(names, count, read, time)}, fields, ledger)
+    topic = Topic(tuple(dict.fromkeys([*columns, time])), count, read, time)
+    return Recording(name, source, {"": topic}, fields, ledger)
 
 
 def _columns(names: Sequence[str], facts: Facts, source: str) -> dict[str, str]:
@@ -203,34 +193,23 @@ def _object(value: Any, path: Path) -> dict[str, Any]:
     return value
 
 
-def _lines(path: Path, key: str) -> dict[int, Facts]:
-    """Return the objects of a file with one a line, by one of their numbers; none without it."""
-    if not path.exists():
-        return {}
-    lines = read_bytes(path, EPISODE.most, TrajectoryError).splitlines()
-    rows = [_object(json.loads(line), path) for line in lines if line.strip()]
+def _by_number(path: Path, key: str) -> dict[int, Facts]:
+    """Return the rows of a file by one of their numbers; none without it."""
+    rows = _rows(path) if path.exists() else []
     return {row[key]: row for row in rows if isinstance(row.get(key), int)}
 
 
-def _entries(path: Path) -> list[dict[str, Any]]:
-    """Return the rows of a table of episodes, without the statistics of their columns."""
-    parquet = library("pyarrow.parquet")
-    with parquet.ParquetFile(path) as file:
+def _rows(path: Path) -> list[dict[str, Any]]:
+    """Return the objects of a file with one a line, or the rows of a table without statistics."""
+    if path.suffix == ".jsonl":
+        lines = read_bytes(path, EPISODE.most, TrajectoryError).splitlines()
+        return [_object(json.loads(line), path) for line in lines if line.strip()]
+    with library("pyarrow.parquet").ParquetFile(path) as file:
         names = [n for n in file.schema_arrow.names if not n.startswith(("stats/", "videos/"))]
         if file.metadata.num_rows > EPISODE.most // 1000:
             raise EPISODE.failure(f"{path} has {file.metadata.num_rows} episodes")
         rows: list[dict[str, Any]] = file.read(columns=names).to_pylist()
     return rows
-
-
-def _tasks(path: Path) -> dict[int, Facts]:
-    """Return the tasks of version 3, whose text is a column or the table's index."""
-    rows = _entries(path) if path.exists() else []
-    return {
-        row["task_index"]: {"task": row.get("task", row.get("__index_level_0__"))}
-        for row in rows
-        if isinstance(row.get("task_index"), int)
-    }
 
 
 READER: Final = Reader(
