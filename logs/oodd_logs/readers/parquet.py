@@ -37,9 +37,8 @@ class _Leaf:
 
     @property
     def label(self) -> str:
-        return ".".join(
-            map(str, filter(lambda step: step != "", (self.column, *self.path, self.figure)))
-        )
+        steps = (self.column, *self.path, self.figure)
+        return ".".join(str(step) for step in steps if step != "")
 
 
 class ParquetRows:
@@ -54,40 +53,73 @@ class ParquetRows:
     """
 
     def __init__(self, path: Path, lists: Sequence[str] = ()) -> None:
-        self.path, self.ledger = path, Ledger()
+        self.path, self.ledger, self._lists = path, Ledger(), lists
+        self._objects: dict[str, Column] = {}
         with self._opened() as file:
             metadata, schema = file.metadata, file.schema_arrow
             self.rows: int = metadata.num_rows
-            groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
+            self._groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
             objects = _objects(schema)
             listed = [f.name for f in schema if "list<" in str(f.type) and f.name not in objects]
-            first = next(file.iter_batches(batch_size=64, columns=listed), None) if listed else None
-        self._starts = np.cumsum([0, *(group.num_rows for group in groups)])
-        columns = _Columns(path, groups, lists, self.ledger)
-        plain = [f for f in schema if f.name not in objects]
-        leaves = [leaf for f in plain for leaf in columns.leaves(f.name, f.type, first)]
+            first = next(file.iter_batches(batch_size=64, columns=listed), {}) if listed else {}
+            if objects:
+                gathered = Gathered(str(path), lists)
+                for batch in file.iter_batches(batch_size=_BATCH // 32, columns=objects):
+                    for row in batch.to_pylist():
+                        gathered.add(row)
+                topic = gathered.topic()
+                self.ledger.merge(gathered.ledger)
+                self._objects = topic.read(topic.names, 0, topic.rows)
+        self._starts = np.cumsum([0, *(group.num_rows for group in self._groups)])
+        leaves: list[_Leaf] = []
+        for f in (f for f in schema if f.name not in objects):
+            cells = first[f.name] if f.name in listed and first else ()
+            value = next((cell.as_py() for cell in cells if cell.is_valid), None)
+            leaves += self._inner(f.name, f.type, value, ())
         check_width(path, len(leaves))
         self._leaves = dict(zip(column_names(leaf.label for leaf in leaves), leaves, strict=True))
-        self._objects = self._gathered(objects, lists) if objects else {}
+        self.names = (*self._leaves, *(name for name in self._objects if name not in self._leaves))
         stamps = [f.name for f in schema if library("pyarrow").types.is_timestamp(f.type)]
         self.time = stamps[0] if len(stamps) == 1 else ""
         self._streams: dict[tuple[str, ...], _Stream] = {}
 
-    def _gathered(self, objects: Sequence[str], lists: Sequence[str]) -> dict[str, Column]:
-        """Return the columns that are made of objects in the rows of others."""
-        rows = Gathered(str(self.path), lists)
-        with self._opened() as file:
-            for batch in file.iter_batches(batch_size=_BATCH // 32, columns=objects):
-                for row in batch.to_pylist():
-                    rows.add(row)
-        topic = rows.topic()
-        self.ledger.merge(rows.ledger)
-        return topic.read(topic.names, 0, topic.rows)
+    def _inner(
+        self, column: str, kind: Any, value: Any, steps: tuple[str | int, ...]
+    ) -> Iterator[_Leaf]:
+        """Yield the columns in one of the file: fields of structures, items of lists."""
+        types = library("pyarrow").types
+        name = ".".join(map(str, (column, *steps)))
+        if types.is_struct(kind):
+            for f in kind:
+                yield from self._inner(column, f.type, (value or {}).get(f.name), (*steps, f.name))
+        elif _is_list(kind):
+            fixed = types.is_fixed_size_list(kind)
+            size = kind.list_size if fixed else len(value or ())
+            total = np.size(value) if value else size
+            wide = any(fnmatch.fnmatch(name, glob) for glob in self._lists)
+            if (number_lists.is_folded(name, total) and not wide) or not (
+                fixed or self._is_constant(name, total)
+            ):
+                self.ledger.add("column", "changed", number_lists.KIND.words, name=name)
+                yield from (_Leaf(column, steps, figure) for figure in number_lists.FIGURES)
+                return
+            for i, item in enumerate(value or [None] * size):
+                yield from self._inner(column, kind.value_type, item, (*steps, i))
+        elif types.is_binary(kind) or types.is_large_binary(kind):
+            self.ledger.add("column", "dropped", images.KIND.words, name=name)
+        else:
+            yield _Leaf(column, steps)
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the columns."""
-        return (*self._leaves, *(name for name in self._objects if name not in self._leaves))
+    def _is_constant(self, name: str, size: int) -> bool:
+        """Tell by the numbers that the file counts whether all lists are as long as the first."""
+        pattern = re.compile(re.escape(re.sub(r"\.\d+\b", "", name)) + r"\.list\..*")
+        every = [group.column(i) for group in self._groups for i in range(group.num_columns)]
+        chunks = [chunk for chunk in every if pattern.fullmatch(chunk.path_in_schema)]
+        values = sum(chunk.num_values for chunk in chunks)
+        counted = [chunk.statistics for chunk in chunks if chunk.statistics]
+        nulls = sum(statistics.null_count or 0 for statistics in counted)
+        rows = self.rows
+        return size > 0 and 0 in {values - size * rows, values - nulls - size * (rows - nulls)}
 
     def topic(self) -> Topic:
         """Return all rows as a topic."""
@@ -96,36 +128,26 @@ class ParquetRows:
     def read(self, names: Sequence[str], start: int, stop: int) -> dict[str, Column]:
         """Return columns of a range of rows."""
         key = tuple(name for name in names if name in self._leaves)
-        table = self._read(key, start, stop) if key else {}
-        table |= {n: self._objects[n][start:stop] for n in names if n not in self._leaves}
+        table = {name: column[start:stop] for name, column in self._objects.items()}
+        if key:
+            stream = self._streams.pop(key, None)
+            group = max(0, int(np.searchsorted(self._starts, start, side="right")) - 1)
+            first = int(self._starts[group])
+            if stream is None or start < stream.first or stream.end < first:
+                stream = _Stream(self.path, self._batches(key, group), first)
+            table |= stream.take(key, start, stop)
+            if (rows := len(table[key[0]])) != stop - start:
+                raise TrajectoryError(f"{self.path} has {rows} of the rows {start} to {stop - 1}")
+            self._streams[key] = stream  # the last one used stands last
+            while len(self._streams) > _STREAMS:
+                self._streams.pop(next(iter(self._streams))).batches.close()
         return {name: table[name] for name in names}
 
-    def _read(self, key: tuple[str, ...], start: int, stop: int) -> dict[str, Column]:
-        stream = self._streams.pop(key, None)
-        group = max(0, int(np.searchsorted(self._starts, start, side="right")) - 1)
-        first = int(self._starts[group])
-        if stream is None or start < stream.first or stream.end < first:
-            leaves = {name: self._leaves[name] for name in key}
-            stream = _Stream(self._batches(leaves, group), first)
-        parts = stream.take(start, stop)
-        if (rows := sum(len(part[key[0]]) for part in parts)) != stop - start:
-            raise TrajectoryError(f"{self.path} has {rows} of the rows {start} to {stop - 1}")
-        self._streams[key] = stream  # the last one used stands last
-        while len(self._streams) > _STREAMS:
-            self._streams.pop(next(iter(self._streams))).batches.close()
-        columns: dict[str, Column] = {}
-        for name in key:
-            cells = [part[name] for part in parts] or [np.empty(0)]
-            size = sum(part.size for part in cells) * max(part.itemsize for part in cells)
-            if cells[0].dtype.kind == "U" and size > EPISODE.most:
-                raise TrajectoryError(f"{self.path}, column {name!r}: texts take {size} bytes")
-            columns[name] = np.concatenate(cells) if len(cells) > 1 else cells[0]
-        return columns
-
-    def _batches(self, leaves: Mapping[str, _Leaf], group: int) -> Generator[dict[str, Column]]:
+    def _batches(self, names: Sequence[str], group: int) -> Generator[dict[str, Column]]:
+        leaves = {name: self._leaves[name] for name in names}
         columns = [*dict.fromkeys(leaf.column for leaf in leaves.values())]
         with self._opened() as file:
-            groups = range(group, len(self._starts) - 1)
+            groups = range(group, len(self._groups))
             for batch in file.iter_batches(batch_size=_BATCH, row_groups=groups, columns=columns):
                 cells = {name: batch.column(leaf.column) for name, leaf in leaves.items()}
                 yield {name: _values(cells[name], leaf, self.path) for name, leaf in leaves.items()}
@@ -139,31 +161,36 @@ class ParquetRows:
 
 @dataclass(slots=True)
 class _Stream:
-    """Batches in a row, of which those are kept that the next range may need."""
+    """Batches in a row, of which the rows from `first` on are kept that the next range may need."""
 
+    path: Path
     batches: Generator[dict[str, Column]]
     first: int
-    kept: list[dict[str, Column]] = field(default_factory=list)
+    kept: dict[str, Column] = field(default_factory=dict)
 
-    def take(self, start: int, stop: int) -> list[dict[str, Column]]:
-        """Return the rows of a range in pieces; what lies before it is forgotten."""
-        while True:
-            while self.kept and self.first + _count(self.kept[0]) <= start:
-                self.first += _count(self.kept.pop(0))
-            if self.end >= stop or (batch := next(self.batches, None)) is None:
-                break
-            self.kept.append(batch)
-        pieces, low = [], self.first
-        for batch in self.kept:
-            rows = slice(max(0, start - low), max(0, stop - low))
-            pieces.append({name: column[rows] for name, column in batch.items()})
-            low += _count(batch)
-        return pieces
+    def take(self, names: Sequence[str], start: int, stop: int) -> dict[str, Column]:
+        """Return the rows of a range; what lies before it is forgotten where more is read."""
+        if stop > (end := self.end):
+            parts = [{name: column[start - self.first :] for name, column in self.kept.items()}]
+            while end < stop and (batch := next(self.batches, None)) is not None:
+                low, end = end, end + _count(batch)
+                if end > start:
+                    parts.append({n: column[max(0, start - low) :] for n, column in batch.items()})
+            self.first = start
+            self.kept = {}
+            for name in names:
+                cells = [part[name] for part in parts if _count(part)] or [np.empty(0)]
+                size = sum(part.size for part in cells) * max(part.itemsize for part in cells)
+                if cells[0].dtype.kind == "U" and size > EPISODE.most:
+                    raise TrajectoryError(f"{self.path}, column {name!r}: texts take {size} bytes")
+                self.kept[name] = np.concatenate(cells) if len(cells) > 1 else cells[0]
+        rows = slice(start - self.first, stop - self.first)
+        return {name: self.kept.get(name, np.empty(0))[rows] for name in names}
 
     @property
     def end(self) -> int:
         """Row after the last one that is in memory."""
-        return self.first + sum(map(_count, self.kept))
+        return self.first + _count(self.kept)
 
 
 def _count(batch: Mapping[str, Column]) -> int:
@@ -178,12 +205,11 @@ def _objects(schema: Any) -> list[str]:
         if types.is_struct(kind):
             stamped = stamp_of({f.name: 0 for f in kind}) is not None
             return stamped or any(is_object(f.type) for f in kind)
-        if _is_list(kind):
-            inner = kind.value_type
-            while _is_list(inner):
-                inner = inner.value_type
-            return not (types.is_primitive(inner) or types.is_binary(inner))
-        return bool(types.is_map(kind))
+        inner = kind
+        while _is_list(inner):
+            inner = inner.value_type
+        is_plain = types.is_primitive(inner) or types.is_binary(inner)
+        return bool(types.is_map(kind) or (inner is not kind and not is_plain))
 
     objects = [f.name for f in schema if is_object(f.type)]
     named = any(_is_list(f.type) and types.is_string(f.type.value_type) for f in schema)
@@ -193,66 +219,6 @@ def _objects(schema: Any) -> list[str]:
 def _is_list(kind: Any) -> bool:
     types = library("pyarrow").types
     return bool(types.is_list(kind) or types.is_large_list(kind) or types.is_fixed_size_list(kind))
-
-
-@dataclass(frozen=True, slots=True)
-class _Columns:
-    """What the columns of a file are made of; `groups` are its row groups."""
-
-    path: Path
-    groups: Sequence[Any]
-    lists: Sequence[str]
-    ledger: Ledger
-
-    def leaves(self, column: str, kind: Any, first: Any) -> list[_Leaf]:
-        """Return the columns in one of the file: fields of structures, items of lists."""
-        value = None
-        if first is not None and column in first.schema.names:
-            value = next((cell.as_py() for cell in first.column(column) if cell.is_valid), None)
-        return [*self._inner(column, kind, value, ())]
-
-    def _inner(
-        self, column: str, kind: Any, value: Any, steps: tuple[str | int, ...]
-    ) -> Iterator[_Leaf]:
-        types = library("pyarrow").types
-        name = ".".join(map(str, (column, *steps)))
-        if len(steps) > 16:
-            raise TrajectoryError(
-                f"{self.path}, column {column!r}: more than 16 levels of structure"
-            )
-        if types.is_struct(kind):
-            for f in kind:
-                yield from self._inner(column, f.type, (value or {}).get(f.name), (*steps, f.name))
-        elif _is_list(kind):
-            size = kind.list_size if types.is_fixed_size_list(kind) else len(value or ())
-            total = np.size(value) if value else size
-            wide = any(fnmatch.fnmatch(name, glob) for glob in self.lists)
-            fixed = types.is_fixed_size_list(kind) or self._is_constant(name, total)
-            if not fixed or (number_lists.is_folded(name, total) and not wide):
-                self.ledger.add("column", "changed", number_lists.KIND.words, name=name)
-                yield from (_Leaf(column, steps, figure) for figure in number_lists.FIGURES)
-                return
-            items = value or [None] * size
-            for i in range(size):
-                yield from self._inner(column, kind.value_type, items[i], (*steps, i))
-        elif types.is_binary(kind) or types.is_large_binary(kind):
-            self.ledger.add("column", "dropped", images.KIND.words, name=name)
-        else:
-            yield _Leaf(column, steps)
-
-    def _is_constant(self, name: str, size: int) -> bool:
-        """Tell by the numbers that the file counts whether all lists are as long as the first."""
-        pattern = re.compile(re.escape(re.sub(r"\.\d+\b", "", name)) + r"\.list\..*")
-        values, nulls, rows = 0, 0, 0
-        for group in self.groups:
-            for i in range(group.num_columns):
-                chunk = group.column(i)
-                if pattern.fullmatch(chunk.path_in_schema):
-                    values += chunk.num_values
-                    statistics = chunk.statistics
-                    nulls += statistics.null_count or 0 if statistics else 0
-            rows += group.num_rows
-        return size > 0 and 0 in {values - size * rows, values - nulls - size * (rows - nulls)}
 
 
 def _values(array: Any, leaf: _Leaf, path: Path) -> Column:
