@@ -119,12 +119,14 @@ class Reader:
         options = dict(options)
         codes = missing_codes.check(missing_codes.KEY, options.pop(missing_codes.KEY, ()))
         check_known(f"option of the format {self.name}", self.options, *options)
-        if not path.exists():
+        if not path.exists() and not path.is_symlink():
             raise UsageError(f"{str(path)!r} does not exist, expected {self.part}")
         if path.is_dir() and not self.directory_markers:
             raise UsageError(f"{str(path)!r} is a directory, expected {self.part}")
         if not path.is_dir() and not path.is_file():
-            raise TrajectoryError(f"{path} is no plain file")
+            raise TrajectoryError(
+                f"{path} is no plain file, but a broken link, a pipe or a device: remove it"
+            )
         with readable(path):
             for recording in self.open(path, options):
                 check_width(recording.source, sum(len(t.names) for t in recording.topics.values()))
@@ -147,13 +149,7 @@ def reader_for(path: Path, form: str = "") -> Reader:
         When there is no such format.
     UsageError
         When the path is of none.
-    TrajectoryError
-        When it is neither a plain file nor a directory.
     """
-    if not path.is_file() and not path.is_dir():
-        raise TrajectoryError(
-            f"{path} is no plain file, but a broken link, a pipe or a device: remove it"
-        )
     offered = readers()
     if form:
         check_known("format", offered, form)

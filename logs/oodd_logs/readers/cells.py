@@ -21,17 +21,9 @@ from oodd_logs.recording import MISSING, Column, Recording, Topic
 WIDEST: Final = 2**14
 """Columns that a recording may have."""
 
-_TRUTHS: Final = {"true": 1.0, "false": 0.0}
+_WORDS: Final = {**dict.fromkeys(MISSING, np.nan), "true": 1.0, "false": 0.0}
 _PROBED: Final = 500  # cells of which one is a number where a column has some
-_KINDS: Final = {
-    "obs": "obs",
-    "observation": "obs",
-    "observations": "obs",
-    "action": "action",
-    "actions": "action",
-    "reward": "reward",
-    "rewards": "reward",
-}
+_ROLE: Final = re.compile(r"(obs)(?:ervations?)?|(action|reward)s?")
 
 
 def number(cell: str, decimal: str = ".") -> float:
@@ -48,18 +40,12 @@ def number(cell: str, decimal: str = ".") -> float:
         if "." in cell:
             raise ValueError(cell)
         cell = cell.replace(decimal, ".")
-    try:
-        value = float(cell)
-    except ValueError:
-        word = cell.strip().lower()
-        if word in MISSING:
-            return np.nan
-        if word in _TRUTHS:
-            return _TRUTHS[word]
-        raise
+    word = cell.strip().lower()
+    if word in _WORDS:
+        return _WORDS[word]
     if not is_plain(cell):
         raise ValueError(cell)
-    return value
+    return float(cell)
 
 
 def numbers(cells: Sequence[str], decimal: str = ".", *, strict: bool = False) -> Column | None:
@@ -126,11 +112,6 @@ def _number_of(cell: str, decimal: str) -> float | None:
     return None
 
 
-def first_text(cells: Sequence[str]) -> int:
-    """Return the position of the first cell that is no number; 0 where all are."""
-    return next((i for i, cell in enumerate(cells) if numbers([cell]) is None), 0)
-
-
 def texts(cells: Sequence[str], what: str) -> Column:
     """Return a column of texts; `TrajectoryError` where it would take too much memory."""
     stripped = [cell.strip() for cell in cells]
@@ -150,10 +131,15 @@ def conventional(name: str) -> str:
     ('obs:flow[l/s]', 'action:u', 'obs_x')
     """
     kind, colon, inner = name.partition(":")
-    role = _KINDS.get(kind.strip().lower())
+    role = _role(kind)
     if role == "reward" and not colon:
         return role
     return f"{role}:{inner.strip()}" if role in {"obs", "action"} and inner.strip() else name
+
+
+def _role(word: str) -> str:
+    match = _ROLE.fullmatch(word.strip().lower())
+    return match[1] or match[2] if match else ""
 
 
 def nearest_spelling(name: str) -> str:
@@ -163,7 +149,7 @@ def nearest_spelling(name: str) -> str:
     ('obs:x', 'action:u', '')
     """
     match = re.fullmatch(r"(obs|observations?|actions?)[ _./-]+(.*\S)", name.strip(), re.IGNORECASE)
-    return f"{_KINDS[match[1].lower()]}:{match[2]}" if match else ""
+    return f"{_role(match[1])}:{match[2]}" if match else ""
 
 
 def check_width(source: object, columns: int) -> None:
@@ -221,30 +207,28 @@ def without_codes(recording: Recording, codes: Mapping[str, Sequence[float | str
 
 
 def _without(topic_name: str, topic: Topic, codes: Mapping[str, Sequence[float | str]]) -> Topic:
-    worded: dict[str, bool] = {}
-
-    def codes_of(name: str) -> list[float | str]:
+    def plain(name: str, cells: Column) -> Column:
         labels = [name, f"{topic_name}.{name}", name.partition("[")[0].rpartition(":")[2]]
         globs = [glob for glob in codes if fnmatch.filter(labels, glob)]
-        return [code for glob in globs for code in codes[glob]]
-
-    def plain(name: str, cells: Column) -> Column:
-        named = codes_of(name)
+        named = [code for glob in globs for code in codes[glob]]
         if cells.dtype.kind == "U":
             return np.where(np.isin(cells, [str(code).strip() for code in named]), "", cells)
         figures = [code for code in named if not isinstance(code, str)]
         return np.where(np.isin(cells, figures), np.nan, cells)
 
+    @functools.cache
+    def is_worded(name: str) -> bool:
+        """Tell for all rows of a column, whatever a range has, whether texts remain."""
+        cells = plain(name, topic.read([name], 0, topic.rows)[name])
+        return cells.dtype.kind == "U" and numbers(cells.tolist(), "") is None
+
     def read(names: Sequence[str], start: int, stop: int) -> dict[str, Column]:
-        columns = {}
-        for name, cells in topic.read(names, start, stop).items():
+        columns = topic.read(names, start, stop)
+        for name, cells in columns.items():
             columns[name] = plain(name, cells)
-            if columns[name].dtype.kind == "U":
-                if name not in worded:  # for all of its rows, whatever this range has
-                    every = plain(name, topic.read([name], 0, topic.rows)[name])
-                    worded[name] = numbers(every.tolist(), "") is None
-                column = None if worded[name] else numbers(columns[name].tolist(), "")
-                columns[name] = columns[name] if column is None else column
+            if columns[name].dtype.kind == "U" and not is_worded(name):
+                column = numbers(columns[name].tolist(), "")
+                columns[name] = np.full(len(cells), np.nan) if column is None else column
         return columns
 
     return dataclasses.replace(topic, read=read)

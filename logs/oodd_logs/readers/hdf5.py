@@ -13,7 +13,7 @@ from oodd_eval.data.bounded import EPISODE
 from oodd_eval.data.facts import Quantity
 from oodd_eval.data.stored import StoredFile
 from oodd_eval.errors import TrajectoryError
-from oodd_logs.readers import TRANSPOSE, Options, Reader, in_order, is_transposed, unreadable
+from oodd_logs.readers import TRANSPOSE, Options, Reader, in_order, is_transposed, readable
 from oodd_logs.readers.matrices import MatrixRows, episode_of, whole_number
 from oodd_logs.recording import Recording
 
@@ -114,10 +114,8 @@ def _fields(file: StoredFile, group: str, source: str) -> dict[str, Any]:
         if name in named:
             fields[name] = whole_number(source, name, named[name])
     if "parameters" in named:
-        try:
+        with readable(f"{source}, attribute parameters,"):
             parameters = json.loads(named["parameters"])
-        except (TypeError, ValueError, RecursionError) as error:
-            raise unreadable(f"{source}, attribute parameters,", error) from error
         fields["parameters"] = parameters if isinstance(parameters, dict) else {}
     return fields
 

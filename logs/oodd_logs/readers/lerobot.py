@@ -4,6 +4,7 @@ Observations and actions have as many rows: what the last action led to was not 
 counts as missing.
 """
 
+import dataclasses
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -43,13 +44,12 @@ def _open(directory: Path, _options: Options) -> Iterator[Recording]:
     parts = _version_3(directory, facts, tables) if tables else _version_2(directory, info)
     for name, source, rows, span, entry, note in parts:
         recording = _episode(name, source, rows, span, facts)
-        fields = recording.fields
-        task = tasks.get(fields.get("task_index", -1), {})
+        task = tasks.get(recording.fields.get("task_index", -1), {})
         text = task.get("task", task.get("__index_level_0__")) or entry.get("tasks")
         if isinstance(text, list | tuple):
             text = text[0] if len(text) == 1 else None
         if isinstance(text, str):
-            fields["task"] = text
+            recording = dataclasses.replace(recording, fields={**recording.fields, "task": text})
         if note:
             reason = "rows are those that the data has, not those of the table of episodes"
             recording.ledger.add("recording", "changed", reason, cell=note)

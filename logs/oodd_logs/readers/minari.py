@@ -11,7 +11,7 @@ from typing import Any, Final
 from oodd_eval.data.bounded import EPISODE, read_json
 from oodd_eval.data.facts import Quantity
 from oodd_eval.errors import TrajectoryError, UsageError
-from oodd_logs.readers import Options, Reader, unreadable
+from oodd_logs.readers import Options, Reader, readable
 from oodd_logs.readers.hdf5 import read_groups
 from oodd_logs.recording import Recording
 
@@ -23,7 +23,7 @@ def _open(directory: Path, _options: Options) -> Iterator[Recording]:
             f"{str(directory)!r} is no Minari dataset in HDF5, expected data/main_data.hdf5 and "
             "data/metadata.json in it"
         )
-    try:
+    with readable(metadata):
         facts = read_json(metadata, EPISODE.most, TrajectoryError)
         observations, actions = (
             json.loads(facts[f"{kind}_space"]) for kind in ("observation", "action")
@@ -38,10 +38,6 @@ def _open(directory: Path, _options: Options) -> Iterator[Recording]:
             further = {"discrete": int(actions.get("n", 0)), "start": int(actions.get("start", 0))}
             if len(commands) == further["discrete"]:
                 further["choices"] = [quantity.name for quantity in commands]
-    except TrajectoryError:
-        raise
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise unreadable(metadata, error) from error
     if kinds[0] != "Box" or kinds[1] not in {"Box", "Discrete"}:
         raise TrajectoryError(
             f"{metadata}: observations are {kinds[0]} and actions {kinds[1]}, expected a Box of "

@@ -61,7 +61,9 @@ class ParquetRows:
             self._groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
             objects = _objects(schema)
             listed = [f.name for f in schema if "list<" in str(f.type) and f.name not in objects]
-            first = next(file.iter_batches(batch_size=64, columns=listed), {}) if listed else {}
+            first: Any = (
+                next(file.iter_batches(batch_size=64, columns=listed), {}) if listed else {}
+            )
             if objects:
                 gathered = Gathered(str(path), lists)
                 for batch in file.iter_batches(batch_size=_BATCH // 32, columns=objects):
