@@ -439,14 +439,15 @@ def test_the_command_prints_and_writes_a_recipe_that_is_read(
     assert Recipe.load(elsewhere).nominal.files == ("*.csv",)
 
 
-def test_a_cell_of_text_is_the_exception_of_its_file(clean):
+@pytest.mark.parametrize("cell", ["broken", "2,5"])
+def test_a_cell_of_text_is_the_exception_of_its_file(clean, cell):
     logs = with_columns(
-        clean, odd=lambda rows, i: ["broken" if (i, k) == (3, 7) else k % 7 for k in range(rows)]
+        clean, odd=lambda rows, i: [cell if (i, k) == (3, 7) else k % 7 + 0.5 for k in range(rows)]
     )
     recipe = Recipe.parse(tomllib.loads(draft(logs)))
     assert ("odd" in recipe.sensors, recipe.missing) == (True, "hold")
     (entry,) = logs.ledger.of("cell", "held")
-    assert (entry.name, entry.row, entry.cell, entry.count) == ("odd", 7, "broken", 1)
+    assert (entry.name, entry.row, entry.cell, entry.count) == ("odd", 7, cell, 1)
     assert entry.first in describe_logs(logs)
 
 
@@ -468,6 +469,17 @@ def test_the_command_advises_only_scans_that_work(tmp_path, capsys, rows, text, 
     command = out.split("Which of them are odd: oodd-eval ")[1].split(" A first")[0]
     assert command.endswith(advised)
     assert main(command.split()) in {0, 1}
+
+
+def test_a_long_list_has_one_line_in_the_table(tmp_path):
+    rows = np.random.default_rng(0).normal(size=(60, 40))
+    lines = [json.dumps({"t": i / 10, "scan": row.tolist()}) for i, row in enumerate(rows)]
+    (tmp_path / "log.jsonl").write_text("\n".join(lines))
+    logs = inspect_logs(tmp_path)
+    assert {"scan.least", "scan.mean", "scan.count"} <= {*logs.columns}
+    table = describe_logs(logs, 120).split("\n\n")[1]
+    (line,) = (line for line in table.splitlines() if line.startswith("scan."))
+    assert line.split()[0] == "scan.least/.mean/.count"
 
 
 def test_an_outcome_and_a_task_of_each_episode_are_named(tmp_path):
