@@ -217,12 +217,12 @@ class ColumnFacts:
 
         Steps count that are inside a recording.
         """
-        recordings = np.searchsorted(self.firsts, np.flatnonzero(present), side="right")
-        joined = numbers[present]
-        if not math.isnan(self.last):
-            joined, recordings = np.append(self.last, joined), np.append(1, recordings)
-        self.last = float(joined[-1])
-        steps = np.diff(joined)[np.diff(recordings) == 0]
+        there = numbers[present]
+        steps = np.diff(there if math.isnan(self.last) else np.append(self.last, there))
+        self.last = float(there[-1])
+        if len(self.sources) > 1:  # which begin in this block
+            recordings = np.searchsorted(self.firsts, np.flatnonzero(present), side="right")
+            steps = steps[np.diff(recordings) == 0]
         self.steps += len(steps)
         span = self.numbers.high - self.numbers.low
         if span > 1.2 * self.span:  # what seemed to be jumps was none

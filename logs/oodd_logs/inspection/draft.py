@@ -75,6 +75,8 @@ def draft(logs: Inspection, prefix: str = "", name: str = "") -> str:
     """
     stem = name or logs.path.resolve().stem
     name = name_of(stem, "logs", {**SPLITS, **ENVIRONMENTS})
+    options = {"format": logs.form, **logs.options}
+    options |= {"transpose": logs.transposed} if logs.transposed else {}
     lines = [
         f"# A first recipe for {logs.path.name}, written by `oodd-eval data inspect`.",
         "# Edit it, then import it with `oodd-eval data import`. What is behind # is not in use.",
@@ -87,12 +89,10 @@ def draft(logs: Inspection, prefix: str = "", name: str = "") -> str:
         *_draft_labels(logs),
         "",
         "[read]",
-        f"format = {toml(logs.form)}",
-        *(f"{key} = {toml(value)}" for key, value in logs.options.items()),
+        *(f"{key} = {toml(value)}" for key, value in options.items()),
+        "",
+        *_draft_files(logs, prefix),
     ]
-    if logs.transposed:
-        lines.append(f"transpose = {toml(logs.transposed)}")
-    lines += ["", *_draft_files(logs, prefix)]
     for i, line in enumerate(lines):
         if line.startswith("#"):  # a line break in a name would end the remark
             lines[i] = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
