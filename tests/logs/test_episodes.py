@@ -376,7 +376,8 @@ def test_values_are_held_over_the_blocks_in_which_they_are_read(tmp_path, monkey
         usual(self, *arguments)
         self._step = 3
 
-    monkeypatch.setattr("oodd_logs.rows._CELLS", 3)
+    for module in ("rows", "recording"):
+        monkeypatch.setattr(f"oodd_logs.{module}.CELLS", 3)
     monkeypatch.setattr(TopicRows, "__init__", make)
     _, parts = read(gappy(tmp_path), missing="hold")
     assert parts["train"][0].observations.tolist() == HELD
