@@ -176,10 +176,6 @@ class EpisodeSource:
         return self
 
     def __exit__(self, *_exception: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Remove the rows from disk."""
         self._spool.close()
 
     @property
@@ -756,10 +752,10 @@ class _Reading:
                 if not median / SLOWER < step < median * SLOWER:
                     reason = f"a row every {step:g} s, where others have one every {median:g} s"
                     self.ledger.add("recording", "kept", reason, source=label)
-        rate, ledger = self.recipe.rate or even_rate(self._all_steps()), self.ledger
-        has_rewards, count = self.first.selection.reward is not None, self.recordings
-        count += len(self.failures)
-        source = EpisodeSource(self.first.spool, has_rewards, rate, parts, ledger, count)
+        rate = self.recipe.rate or even_rate(self._all_steps())
+        has_rewards, count = self.first.selection.reward is not None, len(self.failures)
+        about = rate, parts, self.ledger, self.recordings + count
+        source = EpisodeSource(self.first.spool, has_rewards, *about)
         _say_far(source)
         return source
 

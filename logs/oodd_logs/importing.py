@@ -6,6 +6,7 @@ compare the two from the onset on.
 """
 
 import dataclasses
+import glob
 import itertools
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -206,7 +207,7 @@ def _files_of(form: str, part: Path) -> tuple[str, ...]:
     if not files:
         file_kind = " or ".join(f"*{suffix}" for suffix in reader.suffixes) or reader.part
         raise UsageError(f"{str(part)!r} has no files {file_kind}, expected one an episode")
-    return tuple(re.sub(r"([*?\[])", r"[\1]", str(path)) for path in files)
+    return tuple(glob.escape(str(path)) for path in files)
 
 
 def _is_log(path: Path) -> bool:
@@ -317,14 +318,12 @@ def import_frames(
     from oodd_logs.frames import recordings_of  # noqa: PLC0415  for callers in Python
 
     tests = dict(test) if isinstance(test, Mapping) else {"": test}
-    columns = [labels] if isinstance(labels, str) and labels else [*labels]
-    content: dict[str, Any] = {"split": name, **({"labels": columns} if columns else {}), **keys}
+    content: dict[str, Any] = {"split": name, **({"labels": labels} if labels else {}), **keys}
     content["nominal"] = {"train": TRAIN, "calibration": CALIBRATION, **keys.get("nominal", {})}
     tables = keys.get("anomalous", {})
-    kinds = {kind: {"files": kind} for kind in tests if kind not in {"", "nominal"}}
+    kinds: dict[str, Any] = {kind: {"files": kind} for kind in tests if kind != "nominal"}
+    kinds = {_ANOMALY: {}} if "" in tests else kinds
     content["anomalous"] = {kind: files | tables.get(kind, {}) for kind, files in kinds.items()}
-    if "" in tests:
-        content["anomalous"] = {_ANOMALY: tables.get(_ANOMALY, {})}
     recipe = Recipe.parse(content, "import_frames")
     parts = {TRAIN: train, CALIBRATION: calibration}
     parts |= {f"test/{kind}" if kind else "test": episodes for kind, episodes in tests.items()}

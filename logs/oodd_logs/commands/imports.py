@@ -10,7 +10,6 @@ import click
 from oodd_eval.cli import COUNT, DIRECTORY, OUTPUT_FILE, Converted, Options, command
 from oodd_eval.cli.console import make_console
 from oodd_eval.cli.data import output_option
-from oodd_eval.data.facts import Quantity
 from oodd_eval.data.files import refuse_inputs, write_text
 from oodd_eval.errors import UsageError
 from oodd_eval.names import assignment
@@ -24,12 +23,7 @@ from oodd_logs.readers import quantity
 from oodd_logs.recipe import Recipe
 from oodd_logs.shipped_recipes import shipped_recipes
 
-
-def _quantities(text: str) -> tuple[Quantity, ...]:
-    return tuple(map(quantity, text.split(",")))
-
-
-_QUANTITIES: Final = Converted(_quantities, "NAME[UNIT],...")
+_QUANTITIES: Final = Converted(lambda text: tuple(map(quantity, text.split(","))), "NAME[UNIT],...")
 _GROUP: Final = Converted(assignment, "ANOMALY=sensor|dynamics")
 
 _REQUIRED: Final = ("env", "format", "train", "calibration")
