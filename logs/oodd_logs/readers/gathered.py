@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from oodd_eval.data.bounded import EPISODE
 from oodd_eval.errors import TrajectoryError
-from oodd_logs.kinds import Kind, flattened, number_lists
+from oodd_logs.kinds import flattened, number_lists
 from oodd_logs.kinds.images import LONGEST_TEXT
 from oodd_logs.ledger import Ledger
 from oodd_logs.readers.cells import check_width, column_names, numbers, texts
@@ -97,10 +97,12 @@ class Gathered:
             raise TrajectoryError(f"{name!r:.80} has more than {_DEEPEST} levels of structure")
         if kind is not dict:
             value = _unpacked(value)
-        wide = bool(self._lists) and any(fnmatch.fnmatch(name, glob) for glob in self._lists)
+        wide = any(fnmatch.fnmatch(name, glob) for glob in self._lists)
         if not wide and (known := flattened(name, value)) is not None:
-            self._note(name, *known)
-            for label, inner in known[1]:
+            kind_of_column, pairs = known
+            if kind_of_column.words:
+                self._fates[name.replace(_MARK, ""), kind_of_column.words] = not pairs
+            for label, inner in pairs:
                 self._put(label, inner, row, depth + 1)
         elif isinstance(value, Mapping):
             prefix = f"{name}." if name else ""
@@ -128,10 +130,6 @@ class Gathered:
         else:
             for i, inner in enumerate(value[: number_lists.LONGEST]):
                 self._put(marked.replace("\0", str(i)), inner, row, depth + 1)
-
-    def _note(self, name: str, kind: Kind, pairs: Sequence[tuple[str, Any]]) -> None:
-        if kind.words:
-            self._fates[name.replace(_MARK, ""), kind.words] = not pairs
 
     def _flush(self) -> None:
         """Bring pending rows into arrays."""
@@ -216,38 +214,58 @@ def _unpacked(value: Any) -> Any:
     return value
 
 
+def readable_topics(
+    path: Path,
+    options: Mapping[str, Any],
+    topics: Sequence[str],
+    unread: Mapping[str, str],
+    ledger: Ledger,
+) -> list[str]:
+    """Return topics without those that cannot be read, which have their kind; note them.
+
+    `TrajectoryError` where none can be read, or the options name one that cannot.
+    """
+    if len(unread) == len(topics) or ("topics" in options and unread):
+        listed = ", ".join(f"{topic} ({kind})" for topic, kind in unread.items()) or "no topics"
+        expected = "messages of JSON, or of ROS with their definitions"
+        raise TrajectoryError(f"{path} has {listed}, expected {expected}")
+    for topic, kind in unread.items():
+        ledger.add("column", "dropped", f"its messages ({kind}) are not read", name=topic)
+    return [topic for topic in topics if topic not in unread]
+
+
 def recording_of(
     path: Path,
-    name: str,
+    options: Mapping[str, Any],
     topics: Iterable[str],
     messages: Iterable[tuple[str, int, Any]],
-    *,
-    lists: Sequence[str],
     ledger: Ledger,
 ) -> Recording:
     """Return a recording of messages; topics without any are left out.
 
     Parameters
     ----------
-    path, name
-        The file, and what the recording is called.
+    path
+        The file or directory, from which the recording has its name.
+    options
+        Values of `LISTS`.
     topics
         Names of all topics.
     messages
         Topic, nanoseconds since 1970, and what `Gathered.add` takes.
-    lists
-        See `Gathered`.
     ledger
         Takes what became of values in messages; the recording has it.
     """
+    lists = options.get("lists", ())
     rows = {topic: Gathered(f"{path}, {topic}", lists) for topic in topics}
     for topic, stamp, value in messages:
         rows[topic].add(value, stamp / 1e9)
     filled = {topic: gathered.topic(TIME) for topic, gathered in rows.items() if gathered.rows}
+    if not filled:
+        raise TrajectoryError(f"{path} has no messages")
     for topic in filled:
         for entry in rows[topic].ledger:
             label = f"{topic}.{entry.name}"
             ledger.add(entry.item, entry.fate, entry.reason, name=label, count=entry.count)
-    if not filled:
-        raise TrajectoryError(f"{path} has no messages")
+    name = path.name if path.is_dir() else path.stem
     return Recording(name, str(path), filled, ledger=ledger)

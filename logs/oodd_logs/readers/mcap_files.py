@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from oodd_eval.data.bounded import EPISODE
-from oodd_eval.errors import OoddError, TrajectoryError
+from oodd_eval.errors import OoddError
 from oodd_logs.ledger import Ledger
 from oodd_logs.readers import TOPICS, Options, Reader, chosen, library
-from oodd_logs.readers.gathered import LISTS, recording_of
+from oodd_logs.readers.gathered import LISTS, RECOVERED, readable_topics, recording_of
 from oodd_logs.recording import Recording
 
 
@@ -25,10 +25,10 @@ def _open(path: Path, options: Options) -> Iterator[Recording]:
         except library("mcap.exceptions").McapError:
             summary = None
         if summary is None:
-            channels, schemas = _recovered_channels(path)
-            ledger.add(
-                "recording", "changed", "it was not closed: recovered up to where it breaks off"
-            )
+            named = [r for r in _records(path) if hasattr(r, "id")]
+            channels = {r.id: r for r in named if hasattr(r, "message_encoding")}
+            schemas = {r.id: r for r in named if hasattr(r, "encoding")}
+            ledger.add("recording", "changed", RECOVERED)
         else:
             channels, schemas = summary.channels, summary.schemas
             for chunk in summary.chunk_indexes:
@@ -37,49 +37,30 @@ def _open(path: Path, options: Options) -> Iterator[Recording]:
         decoders: dict[int, Callable[[bytes], Any]] = {}
         unread: dict[str, str] = {}
         for channel in (c for c in channels.values() if c.topic in selected):
-            schema = schemas.get(channel.schema_id)
+            schema, encoding = schemas.get(channel.schema_id), channel.message_encoding
             with contextlib.redirect_stderr(io.StringIO()):  # it prints what it cannot read
-                decoder = ros2.decoder_for(channel.message_encoding, schema)
-            decoder = json.loads if channel.message_encoding == "json" else decoder
+                decoder = ros2.decoder_for(encoding, schema)
+            decoder = json.loads if encoding == "json" else decoder
             if decoder is None:
-                unread[channel.topic] = channel.message_encoding
+                unread[channel.topic] = encoding
             else:
                 decoders[channel.id] = decoder
-        if not decoders or ("topics" in options and unread):
-            raise TrajectoryError(
-                f"{path} has {', '.join(f'{t} ({e})' for t, e in unread.items()) or 'no channels'}"
-                ", expected channels of JSON, or of ROS 2 with their definitions"
-            )
-        for topic, encoding in unread.items():
-            ledger.add("column", "dropped", f"messages of {encoding} are not read", name=topic)
-        readable = [topic for topic in selected if topic not in unread]
+        topics = readable_topics(path, options, selected, unread, ledger)
         if summary is None:
-            messages = (record for record in _records(path) if hasattr(record, "log_time"))
+            messages = (record for record in _records(path) if hasattr(record, "publish_time"))
         else:
-            messages = (message for _, _, message in reader.iter_messages(readable))
+            messages = (message for _, _, message in reader.iter_messages(topics))
         decoded = (
             (channels[m.channel_id].topic, m.log_time, decoders[m.channel_id](m.data))
             for m in messages
-            if m.channel_id in decoders
+            if m.channel_id in decoders and channels[m.channel_id].topic in topics
         )
-        lists = options.get("lists", ())
-        yield recording_of(path, path.stem, readable, decoded, lists=lists, ledger=ledger)
+        yield recording_of(path, options, topics, decoded, ledger)
 
 
 def _check_chunk(path: Path, size: int) -> None:
     if size > EPISODE.most:
         raise EPISODE.failure(f"{path} has a chunk of {size} bytes")
-
-
-def _recovered_channels(path: Path) -> tuple[dict[int, Any], dict[int, Any]]:
-    """Return the channels and schemas of a file without its summary, by their numbers."""
-    channels, schemas = dict[int, Any](), dict[int, Any]()
-    for record in _records(path):
-        if hasattr(record, "message_encoding"):
-            channels[record.id] = record
-        elif hasattr(record, "encoding"):
-            schemas[record.id] = record
-    return channels, schemas
 
 
 def _records(path: Path) -> Iterator[Any]:

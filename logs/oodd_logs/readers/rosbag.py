@@ -14,7 +14,7 @@ from oodd_eval.data.bounded import EPISODE
 from oodd_eval.errors import TrajectoryError
 from oodd_logs.ledger import Ledger
 from oodd_logs.readers import TOPICS, Options, Reader, chosen, in_order, library
-from oodd_logs.readers.gathered import LISTS, RECOVERED, recording_of
+from oodd_logs.readers.gathered import LISTS, RECOVERED, readable_topics, recording_of
 from oodd_logs.recording import Recording
 
 _BORDER: Final = "=" * 80 + "\n"
@@ -64,28 +64,19 @@ def _recording(
     path: Path,
     options: Options,
     connections: Sequence[Any],
-    messages: Messages,
+    read: Messages,
     ledger: Ledger,
 ) -> Recording:
     """Return the messages of a bag, by its connections."""
     selected = chosen(dict.fromkeys(c.topic for c in connections), options)
     store = _types(connections)
     defined = {c.topic for c in connections if c.msgtype in store.fielddefs}
-    undefined = [name for name in selected if name not in defined]
-    if len(undefined) == len(selected) or ("topics" in options and undefined):
-        raise TrajectoryError(
-            f"{path}: definitions of {', '.join(undefined) or 'any topic'} are missing"
-        )
-    for name in undefined:
-        ledger.add("column", "dropped", "its messages have no definition", name=name)
-    is_ros1 = path.suffix.lower() == ".bag"
-    decode = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
-    readable = [c for c in connections if c.topic in selected and c.topic in defined]
-    decoded = ((c.topic, stamp, decode(raw, c.msgtype)) for c, stamp, raw in messages(readable))
-    topics = [name for name in selected if name in defined]
-    name = source.name if source.is_dir() else source.stem
-    lists = options.get("lists", ())
-    return recording_of(source, name, topics, decoded, lists=lists, ledger=ledger)
+    undefined = {name: "without a definition" for name in selected if name not in defined}
+    topics = readable_topics(path, options, selected, undefined, ledger)
+    decode = store.deserialize_ros1 if path.suffix.lower() == ".bag" else store.deserialize_cdr
+    messages = read([c for c in connections if c.topic in topics])
+    decoded = ((c.topic, stamp, decode(raw, c.msgtype)) for c, stamp, raw in messages)
+    return recording_of(source, options, topics, decoded, ledger)
 
 
 def _joined(parts: Sequence[Any]) -> Messages:
@@ -104,44 +95,41 @@ def _unindexed(path: Path) -> tuple[list[Any], Messages]:
     """Return the connections and messages of a bag of ROS 1 without its index, read in a row."""
     rosbag = library("rosbags.rosbag1.reader")
 
-    def records() -> Iterator[tuple[Any, int, bytes]]:
+    def messages(selected: Sequence[Any] | None) -> Iterator[tuple[Any, int, bytes]]:
+        """Yield messages of some connections; those without any for None, with the stamp -1."""
         bag, connections = rosbag.Reader(path), dict[int, Any]()
+        names = {connection.id for connection in selected or ()}
         with path.open("rb") as file:
             if not file.readline(100).startswith(b"#ROSBAG V2.0"):
                 raise TrajectoryError(f"{path} is no bag of version 2.0")
+            files: list[Any] = [file]
             with contextlib.suppress(rosbag.ReaderError, OSError, EOFError, ValueError):
                 while True:
-                    yield from records_at(file, bag, connections)
+                    if files[-1] is not file and files[-1].tell() == len(files[-1].getbuffer()):
+                        files.pop()
+                    stream = files[-1]
+                    start, header = stream.tell(), rosbag.Header.read(stream)
+                    kind = header.get_uint8("op")
+                    if kind == rosbag.RecordType.CONNECTION:
+                        stream.seek(start)
+                        bag.bio = stream
+                        connection = bag.read_connection()
+                        connections[connection.id] = connection
+                        if selected is None:
+                            yield connection, -1, b""
+                        continue
+                    size = rosbag.read_uint32(stream)
+                    EPISODE.check(str(path), np.dtype("u1"), size)
+                    content = rosbag.read_bytes(stream, size)
+                    if kind == rosbag.RecordType.MSGDATA and header.get_uint32("conn") in names:
+                        owner = connections[header.get_uint32("conn")]
+                        yield owner, header.get_time("time"), content
+                    elif kind == rosbag.RecordType.CHUNK:
+                        EPISODE.check(str(path), np.dtype("u1"), header.get_uint32("size"))
+                        unpack = rosbag.decompressors[header.get_string("compression")]
+                        files.append(io.BytesIO(unpack(content)))
 
-    def records_at(file: Any, bag: Any, connections: dict[int, Any]) -> Iterator[Any]:
-        """Yield what the next record holds: connections with the stamp -1, or messages."""
-        start, header = file.tell(), rosbag.Header.read(file)
-        kind = header.get_uint8("op")
-        if kind == rosbag.RecordType.CONNECTION:
-            file.seek(start)
-            bag.bio = file
-            connection = bag.read_connection()
-            connections[connection.id] = connection
-            yield connection, -1, b""
-            return
-        size = rosbag.read_uint32(file)
-        EPISODE.check(str(path), np.dtype("u1"), size)
-        content = rosbag.read_bytes(file, size)
-        if kind == rosbag.RecordType.MSGDATA:
-            yield connections[header.get_uint32("conn")], header.get_time("time"), content
-        elif kind == rosbag.RecordType.CHUNK:
-            EPISODE.check(str(path), np.dtype("u1"), header.get_uint32("size"))
-            inner = io.BytesIO(rosbag.decompressors[header.get_string("compression")](content))
-            while inner.tell() < len(inner.getbuffer()):
-                yield from records_at(inner, bag, connections)
-
-    connections = {c.id: c for c, stamp, _ in records() if stamp < 0}
-
-    def messages(selected: Sequence[Any]) -> Iterator[tuple[Any, int, bytes]]:
-        names = {connection.id for connection in selected}
-        return (record for record in records() if record[1] >= 0 and record[0].id in names)
-
-    return [*connections.values()], messages
+    return [*{c.id: c for c, _, _ in messages(None)}.values()], messages
 
 
 def _types(connections: Sequence[Any]) -> Any:
@@ -149,14 +137,14 @@ def _types(connections: Sequence[Any]) -> Any:
     # The library makes code of definitions: only names and numbers may get into it.
     typesys, formats = library("rosbags.typesys"), library("rosbags.interfaces")
     defined: dict[str, Any] = {}
-    without = [c for c in connections if c.msgdef.format == formats.MessageDefinitionFormat.NONE]
-    for connection in (c for c in connections if c not in without):
-        text = connection.msgdef.data
-        if connection.msgdef.format == formats.MessageDefinitionFormat.MSG:
+    without = False
+    for connection in connections:
+        text, form = connection.msgdef.data, connection.msgdef.format
+        without |= form == formats.MessageDefinitionFormat.NONE
+        if form == formats.MessageDefinitionFormat.MSG:
             defined |= typesys.get_types_from_msg(text, connection.msgtype)
-        else:
-            bodies = [part.partition("\n")[2] for part in text.split(_BORDER)[1:]] or [text]
-            for body in bodies:
+        elif form == formats.MessageDefinitionFormat.IDL:
+            for body in [part.partition("\n")[2] for part in text.split(_BORDER)[1:]] or [text]:
                 defined |= typesys.get_types_from_idl(body)
     for name, (constants, members) in defined.items():
         _check_words((name, [constant[:2] for constant in constants], members))
