@@ -131,14 +131,15 @@ def conventional(name: str) -> str:
     ('obs:flow[l/s]', 'action:u', 'obs_x')
     """
     kind, colon, inner = name.partition(":")
-    role = _role(kind)
+    role = role_of(kind.strip().lower())
     if role == "reward" and not colon:
         return role
     return f"{role}:{inner.strip()}" if role in {"obs", "action"} and inner.strip() else name
 
 
-def _role(word: str) -> str:
-    match = _ROLE.fullmatch(word.strip().lower())
+def role_of(word: str) -> str:
+    """Return obs, action or reward, where a word is one of these or their plural; else nothing."""
+    match = _ROLE.fullmatch(word)
     return match[1] or match[2] if match else ""
 
 
@@ -149,7 +150,7 @@ def nearest_spelling(name: str) -> str:
     ('obs:x', 'action:u', '')
     """
     match = re.fullmatch(r"(obs|observations?|actions?)[ _./-]+(.*\S)", name.strip(), re.IGNORECASE)
-    return f"{_role(match[1])}:{match[2]}" if match else ""
+    return f"{role_of(match[1].lower())}:{match[2]}" if match else ""
 
 
 def check_width(source: object, columns: int) -> None:

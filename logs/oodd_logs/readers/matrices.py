@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
 import numpy as np
@@ -13,14 +12,13 @@ from oodd_eval.data.facts import Quantity
 from oodd_eval.errors import TrajectoryError
 from oodd_logs.kinds import images, number_lists
 from oodd_logs.ledger import Ledger
-from oodd_logs.readers.cells import check_width, column_names
+from oodd_logs.readers.cells import check_width, column_names, role_of
 from oodd_logs.recording import Column, Topic
 
-_OBSERVATIONS: Final = ("observations", "observation", "obs")
-_ACTIONS: Final = ("actions", "action")
-_REWARDS: Final = ("rewards", "reward")
 _KINDS: Final = "fiub"
 _LONGEST_FIELD: Final = 1000  # items
+
+_Place = tuple[int, ...] | str  # of a number in a row, or the figure of all of them
 
 
 class MatrixRows(Protocol):
@@ -36,14 +34,6 @@ class MatrixRows(Protocol):
 
     def __getitem__(self, rows: Any, /) -> NDArray[Any]:
         """Return a range of rows."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Part:
-    """A column of an array: the place of its numbers in a row, or the figure of all of them."""
-
-    array: str
-    column: tuple[int, ...] | str
 
 
 def episode_of(
@@ -74,65 +64,57 @@ def episode_of(
     TrajectoryError
         When there are no rows, or lengths differ.
     """
-    names: dict[str, str] = {}
-    for name in arrays:
-        head = name.partition("/")[0]
-        kind = "obs" if head in _OBSERVATIONS else "action" if head in _ACTIONS else ""
-        names[name] = "reward" if name in _REWARDS else kind
-    observed = {len_of(arrays[n]) for n, kind in names.items() if kind == "obs"}
+    kinds = {name: role_of(name.partition("/")[0]) for name in arrays}
+    kinds |= {name: "" for name, kind in kinds.items() if kind == "reward" and "/" in name}
+    observed = {len_of(arrays[n]) for n, kind in kinds.items() if kind == "obs"}
     if len(observed) > 1:
         raise TrajectoryError(f"{source}: observations have {sorted(observed)} rows")
     # Without observations it is a table: its length is the most frequent one, the longest of these.
     lengths = [len_of(a) for a in arrays.values() if a.dtype.kind in _KINDS and len_of(a) > 1]
-    rows = (
-        observed.pop() if observed else max(lengths, key=lambda n: (lengths.count(n), n), default=0)
-    )
+    rows = max(observed or lengths, key=lambda n: (lengths.count(n), n), default=0)
     if not rows:
-        raise TrajectoryError(f"{source} holds {', '.join(arrays) or 'nothing'}, expected arrays "
-                              "with a row a step, such as observations")  # fmt: skip
-    parts: dict[str, _Part] = {}
+        listed = ", ".join(arrays) or "nothing"
+        expected = "arrays with a row a step, such as observations"
+        raise TrajectoryError(f"{source} holds {listed}, expected {expected}")
+    parts: dict[str, tuple[str, _Place]] = {}
     fields: dict[str, Any] = {}
     ledger = Ledger()
     for name, array in arrays.items():
-        kind, length = names[name], len_of(array)
+        kind, length = kinds[name], len_of(array)
         fits = length in {rows, rows - 1} and len(array.shape) > 0
         if not fits and kind:
             raise TrajectoryError(
                 f"{source}: {name} has shape {array.shape}, expected {rows} or {rows - 1} rows"
             )
-        if not fits or array.dtype.kind not in _KINDS:
-            if len(array.shape) < 2 and (not array.shape or length <= _LONGEST_FIELD):
-                values = np.asarray(array[:] if array.shape else array[()])
-                fields[name] = values.item() if values.size == 1 else values.tolist()
-            else:
-                shape = f"no numbers in {rows} rows: shape {array.shape}, {array.dtype}"
-                ledger.add("column", "dropped", shape, name=name)
-            continue
-        quantities = {"obs": sensors, "action": actions}.get(kind, ())
-        size = math.prod(array.shape[1:])
-        places = _places(name, array, ledger)
-        check_width(source, len(parts) + len(places))
-        for place in places:
-            parts[_label(name, kind, place, size, quantities)] = _Part(name, place)
+        if fits and array.dtype.kind in _KINDS:
+            quantities = {"obs": sensors, "action": actions}.get(kind, ())
+            places = _places(name, array, ledger)
+            check_width(source, len(parts) + len(places))
+            for place in places:
+                parts[_label(name, kind, place, array, quantities)] = name, place
+        elif len(array.shape) < 2 and length <= _LONGEST_FIELD:
+            values = np.asarray(array[()])
+            fields[name] = values.item() if values.size == 1 else values.tolist()
+        else:
+            shape = f"no numbers in {rows} rows: shape {array.shape}, {array.dtype}"
+            ledger.add("column", "dropped", shape, name=name)
     labels = dict(zip(column_names(parts), parts.values(), strict=True))
 
     def read(selected: Sequence[str], start: int, stop: int) -> dict[str, Column]:
         blocks = {}
-        for name in {labels[c].array for c in selected}:
+        for name in {labels[label][0] for label in selected}:
             array = arrays[name]
             size = array.dtype.itemsize * math.prod(array.shape[1:]) * (stop - start)
             EPISODE.check(f"{source}, {name}", array.dtype, size)
             blocks[name] = np.asarray(array[start:stop], np.float64)
         columns = {}
         for label in selected:
-            part = labels[label]
-            block = blocks[part.array]
-            if isinstance(part.column, str):
-                column = number_lists.figures("", block)[f".{part.column}"]
+            name, place = labels[label]
+            if isinstance(place, str):
+                column = number_lists.figures("", blocks[name])[f".{place}"]
             else:
-                index: Any = (slice(None), *part.column)
-                column = block[index]
-            if stop == rows and names[part.array] in {"action", "reward"}:
+                column = blocks[name][:, *place]
+            if stop == rows and kinds[name] in {"action", "reward"}:
                 column = column[: rows - 1 - start]
             columns[label] = np.append(column, np.full(stop - start - len(column), np.nan))
         return columns
@@ -140,35 +122,34 @@ def episode_of(
     return Topic(tuple(labels), rows, read), fields, ledger
 
 
-def _places(
-    name: str, array: MatrixRows, ledger: Ledger
-) -> Sequence[tuple[int, ...]] | Sequence[str]:
+def _places(name: str, array: MatrixRows, ledger: Ledger) -> Sequence[_Place]:
     """Return the columns of an array: places in a row, figures, or none of an image."""
     size = math.prod(array.shape[1:])
-    if len(array.shape) > 2 and size > number_lists.LONGEST:
-        if array.dtype.itemsize == 1 or size > images.PIXELS:
-            ledger.add("column", "dropped", images.KIND.words, name=name)
-            return ()
-        ledger.add("column", "changed", number_lists.KIND.words, name=name)
-        return number_lists.FIGURES
-    return [*np.ndindex(*array.shape[1:])]
+    if len(array.shape) < 3 or size <= number_lists.LONGEST:
+        return [*np.ndindex(*array.shape[1:])]
+    if array.dtype.itemsize == 1 or size > images.PIXELS:
+        ledger.add("column", "dropped", images.KIND.words, name=name)
+        return ()
+    ledger.add("column", "changed", number_lists.KIND.words, name=name)
+    return number_lists.FIGURES
 
 
 def _label(
-    name: str, kind: str, place: tuple[int, ...] | str, width: int, quantities: Sequence[Quantity]
+    name: str, kind: str, place: _Place, array: MatrixRows, quantities: Sequence[Quantity]
 ) -> str:
     """Return the name of a column; observations and actions have those of quantities, if any."""
     if kind == "reward":
         return kind
     steps = (place,) if isinstance(place, str) else place
     inner = (name.partition("/")[2] if kind else name).replace("/", ".")
-    prefix = f"{kind}:" if kind else ""
-    if inner:
-        return prefix + ".".join((inner, *map(str, steps)))
-    if len(quantities) == width and len(steps) < 2:
+    if not inner and len(quantities) == math.prod(array.shape[1:]) and len(steps) < 2:
         quantity = quantities[int(steps[0]) if steps else 0]
-        return prefix + quantity.name + ("" if quantity.unit == "1" else f"[{quantity.unit}]")
-    return f"{prefix}{'sensor' if kind == 'obs' else kind} {'.'.join(map(str, steps or (0,)))}"
+        label = quantity.name + ("" if quantity.unit == "1" else f"[{quantity.unit}]")
+    elif inner:
+        label = ".".join((inner, *map(str, steps)))
+    else:
+        label = f"{'sensor' if kind == 'obs' else kind} {'.'.join(map(str, steps or (0,)))}"
+    return f"{kind}:{label}" if kind else label
 
 
 def len_of(array: MatrixRows) -> int:
