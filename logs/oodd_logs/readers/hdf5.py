@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from oodd_eval.data.bounded import EPISODE
 from oodd_eval.data.facts import Quantity
@@ -57,26 +56,16 @@ def read_groups(
             if flag in arrays and not np.any(arrays[flag][:-1]):
                 name = "terminated" if flag == "terminations" else "truncated"
                 fields[name] = bool(np.any(arrays.pop(flag)[-1:]))
-        if transposed:
-            arrays = {k: _Transposed(a) if len(a.shape) == 2 else a for k, a in arrays.items()}
+        for label in [n for n, rows in arrays.items() if transposed and len(rows.shape) == 2]:
+            rows = arrays[label]
+            size = rows.dtype.itemsize * math.prod(rows.shape)
+            EPISODE.check(f"{source}, {label}", rows.dtype, size)
+            arrays[label] = rows[:].T
         topic, single, ledger = episode_of(arrays, source, sensors, actions)
         for name, reason in skipped.items():
             ledger.add("column", "dropped", reason, name=name)
         name = path.stem if group == "/" else group.rpartition("/")[2]
         yield Recording(name, source, {"": topic}, {**single, **fields, **(further or {})}, ledger)
-
-
-class _Transposed:
-    """A dataset whose columns are rows."""
-
-    def __init__(self, rows: MatrixRows) -> None:
-        self._rows, self.shape, self.dtype = rows, rows.shape[::-1], rows.dtype
-
-    def __getitem__(self, rows: Any, /) -> NDArray[Any]:
-        size = self.dtype.itemsize * math.prod(self.shape)
-        EPISODE.check("a transposed dataset", self.dtype, size)
-        columns: NDArray[Any] = self._rows[:].T[rows]
-        return columns
 
 
 def _episodes(file: StoredFile, group: str, depth: int) -> list[str]:
@@ -101,21 +90,19 @@ def _arrays(
             skipped[f"{prefix}{name}"] = "texts in an array"
         elif rows is not None:
             yield f"{prefix}{name}", rows
-        elif rows is None and depth < _DEEPEST:
+        elif depth < _DEEPEST:
             inner = f"{group.rstrip('/')}/{name}"
             yield from _arrays(file, inner, f"{prefix}{name}/", depth + 1, skipped)
 
 
 def _fields(file: StoredFile, group: str, source: str) -> dict[str, Any]:
-    named = file.attributes(group, ("onset", "seed", "parameters"))
     single = file.single_values(group).items()
     fields = {k: v for k, v in single if not isinstance(v, str) or len(v) <= _LONGEST}
-    for name in ("onset", "seed"):
-        if name in named:
-            fields[name] = whole_number(source, name, named[name])
-    if "parameters" in named:
+    for name, value in file.attributes(group, ("onset", "seed")).items():
+        fields[name] = whole_number(source, name, value)
+    for value in file.attributes(group, ("parameters",)).values():
         with readable(f"{source}, attribute parameters,"):
-            parameters = json.loads(named["parameters"])
+            parameters = json.loads(value)
         fields["parameters"] = parameters if isinstance(parameters, dict) else {}
     return fields
 

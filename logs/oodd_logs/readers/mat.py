@@ -1,5 +1,6 @@
 """Recordings as MATLAB files: matrices and vectors of numbers, of version 5 and of 7.3, HDF5."""
 
+import math
 import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -20,60 +21,49 @@ _CLASSES: Final = {"double", "single", "logical"} | {
 }
 """Classes of variables that are numbers; structures, cells and objects are left alone."""
 
-Arrays = Mapping[str, NDArray[Any]]
-
 
 def _open(path: Path, options: Options) -> Iterator[Recording]:
-    with path.open("rb") as file:
-        head = file.read(128)
-    is_hdf5 = b"MATLAB 7.3" in head or head.startswith(b"\x89HDF")
-    arrays = _version_7(path, options) if is_hdf5 else _version_5(path, options)
-    transposed = is_transposed(path, options)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of names that occur twice
+        arrays = _arrays(path, options)
     plain = {}
     for name, array in arrays.items():
-        plain[name] = array.T if transposed else array
+        plain[name] = array.T if is_transposed(path, options) else array
         if 1 in array.shape:
             plain[name] = array.ravel() if array.size > 1 else array.reshape(())
     topic, fields, ledger = episode_of(plain, str(path))
     yield Recording(path.stem, str(path), {"": topic}, fields, ledger)
 
 
-def _version_5(path: Path, options: Options) -> Arrays:
-    scipy = library("scipy.io")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of names that occur twice
-        present = {name: (shape, kind) for name, shape, kind in scipy.whosmat(path)}
-        names = _variables(path, {n: kind for n, (_, kind) in present.items()}, options)
-        size = sum(8 * int(np.prod(present[name][0], dtype=object)) for name in names)
-        EPISODE.check(str(path), np.dtype(float), size)
-        content = scipy.loadmat(path, variable_names=names)
-    arrays = {name: np.asarray(content[name]) for name in names if name in content}
-    return {name: a for name, a in arrays.items() if a.dtype.kind in EPISODE.kinds and a.ndim == 2}
-
-
-def _version_7(path: Path, options: Options) -> Arrays:
-    """Return the variables of an HDF5 file, in which rows and columns are in MATLAB's order."""
-    file = StoredFile(path, EPISODE)
-    present = {name: rows for name, rows in file.members("/").items() if rows is not None}
-    kinds = {name: "double" if r.dtype.kind in "fiub" else "other" for name, r in present.items()}
-    names = _variables(path, kinds, options)
-    taken = 0
-    for name in names:
-        taken = EPISODE.check(f"{path}, {name}", present[name].dtype, present[name].nbytes, taken)
-    arrays = {n: present[n][:].T for n in names if len(present[n].shape) == 2}
-    file.close()
-    return arrays
-
-
-def _variables(path: Path, kinds: Mapping[str, str], options: Options) -> list[str]:
-    """Return the variables to read: those of the option ``variable``, or all that are numbers."""
+def _arrays(path: Path, options: Options) -> Mapping[str, NDArray[Any]]:
+    """Return the variables of the option ``variable``, or all that are matrices of numbers."""
+    with path.open("rb") as opened:
+        head = opened.read(128)
+    file = None
+    if b"MATLAB 7.3" in head or head.startswith(b"\x89HDF"):
+        file = StoredFile(path, EPISODE)
+        present = {name: rows for name, rows in file.members("/").items() if rows is not None}
+        kinds = {n: "double" if r.dtype.kind in "fiub" else "other" for n, r in present.items()}
+        sizes = {name: rows.nbytes for name, rows in present.items()}
+    else:
+        listed = library("scipy.io").whosmat(path)
+        kinds = {name: kind for name, _, kind in listed}
+        sizes = {name: 8 * math.prod(shape) for name, shape, _ in listed}
     numeric = [name for name, kind in kinds.items() if kind in _CLASSES]
     if not numeric:
         raise TrajectoryError(
             f"{path} has {', '.join(f'{n} ({k})' for n, k in kinds.items()) or 'no variables'}"
             ", expected matrices or vectors of numbers: save the fields of structures as variables"
         )
-    return chosen(numeric, options, "variable")
+    names = chosen(numeric, options, "variable")
+    EPISODE.check(str(path), np.dtype(float), sum(sizes[name] for name in names))
+    if file:
+        arrays = {name: present[name][:].T for name in names if len(present[name].shape) == 2}
+        file.close()
+        return arrays  # rows and columns are in MATLAB's order
+    content = library("scipy.io").loadmat(path, variable_names=names)
+    arrays = {name: np.asarray(content[name]) for name in names if name in content}
+    return {name: a for name, a in arrays.items() if a.dtype.kind in EPISODE.kinds and a.ndim == 2}
 
 
 READER: Final = Reader(
