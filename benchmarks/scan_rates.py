@@ -173,7 +173,7 @@ def draws(nominal, anomalous, options, share, **arguments):
         scan = scan_episodes([*some, *others], detector=options.detector, fdr=options.fdr,
                              **arguments)  # fmt: skip
         called.append(bool(scan.odd))
-        places = np.array([one.place for one in scan.episodes[len(some) :]])
+        places = np.array([one.position for one in scan.episodes[len(some) :]])
         if count:
             sure = np.array([one.odd for one in scan.episodes])
             true = sure[len(some) :].sum()

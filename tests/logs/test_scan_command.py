@@ -195,7 +195,7 @@ def test_labels_decide_nothing_and_their_places_are_said(tmp_path, capsys):
         file.write_text("\n".join([f"{header},fault", *lines]) + "\n")
     code, out = run(capsys, tmp_path / "logs", f"--json={tmp_path}/scan.json")
     content = json.loads((tmp_path / "scan.json").read_text())
-    places = sorted(episode["place"] for episode in content["episodes"] if episode["label"])
+    places = sorted(episode["position"] for episode in content["episodes"] if episode["label"])
     said = f"3 episodes, 0 of them odd here; their places are {', '.join(map(str, places))}."
     assert f"Anomalous by their labels: {said}" in " ".join(out.split())
     assert code == 0
@@ -269,10 +269,10 @@ def test_json_holds_what_the_page_of_scans_documents(scan):
 
 def test_page_needs_nothing_else_and_ranks_episodes_in_bands(scan):
     text = page(scan, "logs & more", first=6)
-    shown = [s for s in scan.ranked if s.place <= 6 or s.band != "fine"]
+    shown = [s for s in scan.ranked if s.position <= 6 or s.band != "fine"]
     assert text.count("<svg") == text.count("</svg>") == len(shown)
     addresses = re.findall(r"""(?:href|src)=["']([^"']*)""", text)
-    assert addresses == [f"#episode-{one.place}" for one in shown]
+    assert addresses == [f"#episode-{one.position}" for one in shown]
     assert not re.search(r"https?:|<script|<link|@import|url\(", text)
     assert "logs &amp; more" in text
     assert "run <5>" not in text
@@ -298,7 +298,7 @@ def test_pictures_are_of_suspects_beside_the_others(scan):
 
 
 def test_pictures_are_bounded(scan):
-    places = [replace(scan.odd[0], place=i + 1) for i in range(PICTURES + 7)]
+    places = [replace(scan.odd[0], position=i + 1) for i in range(PICTURES + 7)]
     text = page(replace(scan, episodes=places))
     assert text.count("<svg") == PICTURES
     assert "7 more" in text

@@ -226,7 +226,7 @@ def _print_table(result: Scan, options: Options, console: Console) -> None:
     listed = [
         scanned
         for scanned in result.ranked
-        if scanned.place <= options.first or scanned.band != "fine" or options.verbosity > 0
+        if scanned.position <= options.first or scanned.band != "fine" or options.verbosity > 0
     ]
     titles, rows = table_of(listed)
     # Names may have line breaks.
@@ -252,7 +252,7 @@ def _print_notes(result: Scan, logs: RecordedLogs, console: Console) -> None:
     if labelled := [scanned for scanned in result.ranked if scanned.label]:
         anomalous = counted(len(labelled), "episode(s)")
         odd = sum(scanned.odd for scanned in labelled)
-        places = ", ".join(str(scanned.place) for scanned in labelled[:20])
+        places = ", ".join(str(scanned.position) for scanned in labelled[:20])
         print_prose(
             f"Anomalous by their labels: {anomalous}, {odd} of them odd here; their places are "
             f"{places}{', ...' * (len(labelled) > 20)}.",

@@ -168,7 +168,7 @@ class Gathered:
             self._fates[plain, number_lists.KIND.words] = False
             folded = [(places, number_lists.figures(plain, block)) for places, block in parts]
             return {
-                label: self._column([(places, made[label]) for places, made in folded])
+                label: self._column([(places, of_figures[label]) for places, of_figures in folded])
                 for label in folded[0][1]
             }
         columns = {}

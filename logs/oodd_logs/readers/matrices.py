@@ -90,8 +90,8 @@ def episode_of(
             quantities = {"obs": sensors, "action": actions}.get(kind, ())
             places = _places(name, array, ledger)
             check_width(source, len(parts) + len(places))
-            for place in places:
-                parts[_label(name, kind, place, array, quantities)] = name, place
+            for index in places:
+                parts[_label(name, kind, index, array, quantities)] = name, index
         elif len(array.shape) < 2 and length <= _LONGEST_FIELD:
             values = np.asarray(array[()])
             fields[name] = values.item() if values.size == 1 else values.tolist()
@@ -109,11 +109,11 @@ def episode_of(
             blocks[name] = np.asarray(array[start:stop], np.float64)
         columns = {}
         for label in selected:
-            name, place = labels[label]
-            if isinstance(place, str):
-                column = number_lists.figures("", blocks[name])[f".{place}"]
+            name, index = labels[label]
+            if isinstance(index, str):
+                column = number_lists.figures("", blocks[name])[f".{index}"]
             else:
-                column = blocks[name][:, *place]
+                column = blocks[name][:, *index]
             if stop == rows and kinds[name] in {"action", "reward"}:
                 column = column[: rows - 1 - start]
             columns[label] = np.append(column, np.full(stop - start - len(column), np.nan))
@@ -135,12 +135,12 @@ def _places(name: str, array: MatrixRows, ledger: Ledger) -> Sequence[_Place]:
 
 
 def _label(
-    name: str, kind: str, place: _Place, array: MatrixRows, quantities: Sequence[Quantity]
+    name: str, kind: str, index: _Place, array: MatrixRows, quantities: Sequence[Quantity]
 ) -> str:
     """Return the name of a column; observations and actions have those of quantities, if any."""
     if kind == "reward":
         return kind
-    steps = (place,) if isinstance(place, str) else place
+    steps = (index,) if isinstance(index, str) else index
     inner = (name.partition("/")[2] if kind else name).replace("/", ".")
     if not inner and len(quantities) == math.prod(array.shape[1:]) and len(steps) < 2:
         quantity = quantities[int(steps[0]) if steps else 0]

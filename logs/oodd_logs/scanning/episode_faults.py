@@ -82,7 +82,7 @@ class CleanedEpisode:
         ):
             value = self.recorded[fault.row, names.index(fault.what)]
             reason = "a broken number, beyond a million deviations"
-            where = {"name": fault.what, "source": source, "row": fault.row}
+            where: dict[str, Any] = {"name": fault.what, "source": source, "row": fault.row}
             ledger.add("cell", "held", reason, count=int(count), cell=f"{value:g}", **where)
 
 

@@ -118,7 +118,7 @@ class Finding(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Evidence:
+class EpisodeEvidence:
     """What speaks for one episode's being odd.
 
     Attributes
@@ -227,13 +227,13 @@ class Evidence:
         if self.readings is None:
             return self.faults
         broken = {fault.what for fault in self.faults if fault.fault == "broken"}
-        found = self.readings.faults(least - STREAM, names)
+        faults = self.readings.faults(least - STREAM, names)
         # A broken number is what is missing.
-        return (*(f for f in found if f.what not in broken or f.fault != "missing"), *self.faults)
+        return (*(f for f in faults if f.what not in broken or f.fault != "missing"), *self.faults)
 
     def finding(
         self,
-        found: Floats,
+        surprises: Floats,
         joint: Floats,
         limits: tuple[float, float],
         other_sums: Floats,
@@ -244,7 +244,7 @@ class Evidence:
 
         Parameters
         ----------
-        found
+        surprises
             Surprise of score, stream and figures.
         joint
             See `joint`.
@@ -260,7 +260,7 @@ class Evidence:
         threshold, usual = limits
         statistic = np.where(np.isnan(joint), -np.inf, joint)
         top = int(statistic.argmax())
-        reason, by_figure = "", self.figure is not None and found[2] >= found[:2].max()
+        reason, by_figure = "", self.figure is not None and surprises[2] >= surprises[:2].max()
         is_odd = threshold < math.inf or math.isnan(threshold)
         if by_figure and self.figure is not None:
             _, d, row, figure, value = self.figure

@@ -61,7 +61,7 @@ def compare_figures(episodes: Sequence[Floats], groups: Sequence[Hashable]) -> l
         One an episode.
     """
     figures = np.stack([_figures(rows) for rows in episodes])
-    found: dict[int, Figure] = {}
+    oddest: dict[int, Figure] = {}
     for group in {*groups}:
         inside = np.array([other == group for other in groups])
         peers = figures[inside] if inside.sum() >= LEAST else figures
@@ -75,8 +75,8 @@ def compare_figures(episodes: Sequence[Floats], groups: Sequence[Hashable]) -> l
                 row = int(np.nanargmax(rows) if k else np.nanargmin(rows))
             low, high = ends[:, k, d]
             reason = f"is {figures[i, k, d]:.3g}, of most others {low:.3g} to {high:.3g}"
-            found[i] = Figure(float(away[k, d]), d, row, f"{KINDS[k]} of", reason)
-    return [found[i] for i in range(len(episodes))]
+            oddest[i] = Figure(float(away[k, d]), d, row, f"{KINDS[k]} of", reason)
+    return [oddest[i] for i in range(len(episodes))]
 
 
 def _figures(rows: Floats) -> Floats:

@@ -103,7 +103,7 @@ class Fit:
         -------
         list of Outcome
         """
-        apart, told = sorted(left_out), {*explained}
+        apart, to_explain = sorted(left_out), {*explained}
         kept = [i for i in range(len(episodes)) if i not in {*apart}]
         parts = [kept[k::folds] for k in range(min(folds, len(kept)))]
         judged = [[*part, *apart] for part in parts]
@@ -111,7 +111,7 @@ class Fit:
             [[episodes[i] for i in kept if i not in {*part}] for part in parts],
             [[episodes[i] for i in numbers] for numbers in judged],
             # One explanation of an episode is enough.
-            [[i in told and (i in part or part is parts[0]) for i in [*part, *apart]]
+            [[i in to_explain and (i in part or part is parts[0]) for i in [*part, *apart]]
              for part in parts],
         )  # fmt: skip
         if jobs == 1:

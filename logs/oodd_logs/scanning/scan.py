@@ -37,7 +37,14 @@ from oodd_logs.scanning.episode_faults import (
     gaps,
     stream_scale,
 )
-from oodd_logs.scanning.evidence import SCORE, Evidence, Finding, Peers, Readings, evidence_of
+from oodd_logs.scanning.evidence import (
+    SCORE,
+    EpisodeEvidence,
+    Finding,
+    Peers,
+    Readings,
+    evidence_of,
+)
 from oodd_logs.scanning.figures import compare_figures
 from oodd_logs.scanning.fits import Fit, thinned
 from oodd_logs.scanning.limits import FITS, SHORTEST, WINDOWS
@@ -95,7 +102,7 @@ class ScannedEpisode:
         Of the stream: those that would make an episode odd, and gaps, which do not.
     band
         Whether it is odd (``"surely"``), or to be looked at.
-    place
+    position
         In the ranking; 1 is the oddest.
     reason
         What is oddest about it, in a clause.
@@ -116,7 +123,7 @@ class ScannedEpisode:
     sensors: Mapping[str, float]
     faults: tuple[EpisodeFault, ...]
     band: Band = "fine"
-    place: int = 1
+    position: int = 1
     reason: str = ""
 
     @property
@@ -164,7 +171,7 @@ class ScannedEpisode:
             "rows": len(self.scores),
             "odd": self.odd,
             "band": self.band,
-            "place": self.place,
+            "position": self.position,
             "reason": self.reason,
             **{name: getattr(self, name) for name in figures},
             "first_odd_row": first,
@@ -214,7 +221,7 @@ class Scan:
     @property
     def ranked(self) -> list[ScannedEpisode]:
         """All episodes, the oddest first."""
-        return sorted(self.episodes, key=lambda scanned: scanned.place)
+        return sorted(self.episodes, key=lambda scanned: scanned.position)
 
     @property
     def odd(self) -> list[ScannedEpisode]:
@@ -397,15 +404,15 @@ def _confirmed(episodes: Sequence[Episode], fine: Sequence[str]) -> list[int]:
     """Return the numbers of episodes that are named as fine."""
     numbers: set[int] = set()
     for pattern in fine:
-        found = {
+        matches = {
             i
             for i, name in enumerate(episode.name for episode in episodes)
             # A recording stands for its windows.
             if pattern in {name, name.partition("[")[0]} or fnmatchcase(name, pattern)
         }
-        if not found:
+        if not matches:
             raise UnknownNameError("episode", pattern, [episode.name for episode in episodes])
-        numbers |= found
+        numbers |= matches
     return sorted(numbers)
 
 
@@ -478,7 +485,7 @@ class _Passes:
         everything = range(len(self.episodes))
         return [Peers.of(self.episodes, i, everything) for i in everything]
 
-    def evidence(self, names: Sequence[str], first: int) -> list[Evidence]:
+    def evidence(self, names: Sequence[str], first: int) -> list[EpisodeEvidence]:
         """Judge the episodes, and explain the first of the ranking."""
         count, trajectories = len(self.episodes), [x.trajectory for x in self.cleaned]
         scale, seen = stream_scale(self.cleaned, self.fit.baseline)
@@ -489,7 +496,7 @@ class _Passes:
         beside = np.array([x.max() for x in stream]), np.array([x.distance for x in figures])
         if self.progress is not None:
             self._ranked(_GLANCE, 2, beside)
-        apart, explained = [], range(count)
+        apart, explained = list[int](), [*range(count)]
         if count >= ENOUGH:
             ranked = self._ranked(_ROWS, FITS, beside)
             # Of fewer, fits need all: what they lack makes nominal ones odder than it hides.
@@ -499,7 +506,7 @@ class _Passes:
         breaks = breaks_of(self.episodes)
         usual = float(np.quantile(breaks, 1 - ODD_SHARE, method="nearest"))
         return [
-            Evidence(
+            EpisodeEvidence(
                 episode,
                 outcomes[i][0],
                 statistics[i],
@@ -577,16 +584,18 @@ class _Comparison:
 
 
 def _by_calibration(
-    evidence: Sequence[Evidence], watchdog: Watchdog, fine: Sequence[int], fdr: float
+    evidence: Sequence[EpisodeEvidence], watchdog: Watchdog, fine: Sequence[int], fdr: float
 ) -> _Comparison:
     """Compare with a watchdog's calibration episodes, or with its threshold alone."""
     calibration, largest = watchdog.calibration, np.array([one.largest for one in evidence])
     limit, count = watchdog.rule.threshold, len(evidence)
     if calibration is None:
-        found = np.column_stack([np.zeros(count), *[np.full(count, -math.inf)] * 2])
+        surprises = np.column_stack([np.zeros(count), *[np.full(count, -math.inf)] * 2])
         nothing: tuple[list[None], Floats] = [None] * count, np.full(count, math.nan)
-        apart = True, False, lambda *_: limit, [False] * count
-        return _Comparison(found, found, *nothing, 0, *apart, limit)
+        below = [False] * count
+        return _Comparison(
+            surprises, surprises, *nothing, 0, True, False, lambda *_: limit, below, limit
+        )
     numbers = np.array(calibration.recordings)
     recordings = len({*numbers.tolist()})
     # Windows count where recordings are too few.
@@ -603,13 +612,13 @@ def _by_calibration(
 
     score = np.array([surprise(x, *reference) for x in largest.tolist()])
     ranks = np.array([rank_p(x, *reference) for x in largest.tolist()])
-    found = np.column_stack([score, *[np.full(count, -math.inf)] * 2])
+    surprises = np.column_stack([score, *[np.full(count, -math.inf)] * 2])
     apart = True, exact, threshold, [False] * count
-    return _Comparison(found, found, [tail] * count, ranks, units, *apart, limit)
+    return _Comparison(surprises, surprises, [tail] * count, ranks, units, *apart, limit)
 
 
 def _by_others(
-    evidence: Sequence[Evidence], peers: Sequence[Peers], fine: Sequence[int], fdr: float
+    evidence: Sequence[EpisodeEvidence], peers: Sequence[Peers], fine: Sequence[int], fdr: float
 ) -> _Comparison:
     """Compare episodes with the others, or with those that are confirmed if these are enough."""
     episodes, count = [one.episode for one in evidence], len(evidence)
@@ -623,8 +632,8 @@ def _by_others(
     distances = np.array([one.figure.distance if one.figure else 0.0 for one in evidence])
     # Ranks are exact where all are compared alike.
     compared = peers if exact else reference
-    found, excesses = evidence_of(largest, stream, distances, compared)
-    best, rank = found.max(axis=1), excesses.max(axis=1)
+    surprises, excesses = evidence_of(largest, stream, distances, compared)
+    best, rank = surprises.max(axis=1), excesses.max(axis=1)
     tails = [Tail.fit(largest[x.numbers], x.weights) for x in compared]
     ranks = [rank_p(x, best[y.numbers], y.weights) for x, y in zip(best, reference, strict=True)]
 
@@ -640,12 +649,15 @@ def _by_others(
     ]
     units = min(others.units for others in reference)
     return _Comparison(
-        found, excesses, tails, np.array(ranks), units, is_apart, exact, threshold, above
+        surprises, excesses, tails, np.array(ranks), units, is_apart, exact, threshold, above
     )
 
 
 def _verdict(
-    evidence: Sequence[Evidence], names: Sequence[str], comparison: _Comparison, terms: _Terms
+    evidence: Sequence[EpisodeEvidence],
+    names: Sequence[str],
+    comparison: _Comparison,
+    terms: _Terms,
 ) -> Scan:
     """Call episodes odd, rank all, and look for rows and sensors."""
     count, fine, fdr = len(evidence), {*terms.fine}, terms.fdr
@@ -662,32 +674,32 @@ def _verdict(
     mixed = not comparison.is_apart and bool(called.sum() > ODD_SHARE * tested.sum())
     notes = [*terms.notes, *_remarks(comparison, int(called.sum()) if mixed else 0, len(fine))]
     order = np.lexsort((-largest, -comparison.excesses.max(axis=1), ~called, ~tested)).tolist()
-    places = {i: place for place, i in enumerate(order, 1)}
+    positions = {i: position for position, i in enumerate(order, 1)}
     needed = -math.log(critical if critical > 0 else _FEW)
     sums = np.stack([one.sums for one in evidence])
     scanned = []
     for i, one in enumerate(evidence):
         odd, suspicious = bool(called[i]) and not mixed, bool(called[i]) or comparison.above_fine[i]
         band: Band = "surely" if odd else "fine"
-        if not odd and tested[i] and (places[i] <= terms.first or suspicious or above_limit[i]):
+        if not odd and tested[i] and (positions[i] <= terms.first or suspicious or above_limit[i]):
             band = "look at"
-        found, tail = comparison.surprises[i], comparison.tails[i]
+        surprises, tail = comparison.surprises[i], comparison.tails[i]
         threshold = comparison.threshold(i, needed) if has_p_values else comparison.limit
-        joint = one.joint(tail, float(found[1]))
+        joint = one.joint(tail, float(surprises[1]))
         faults = one.listed(needed, names)
         limits = threshold if odd else math.inf, -math.inf if tail is None else tail.start
         finding = one.finding(
-            found if odd else comparison.excesses[i],
+            surprises if odd else comparison.excesses[i],
             joint,
             limits,
             sums.sum(axis=0) - sums[i],
             faults,
             names,
         )
-        shown = finding if band != "fine" else Finding(None, None, (), {}, finding.reason)
+        detail = finding if band != "fine" else Finding(None, None, (), {}, finding.reason)
         as_rare = -math.inf
-        if tail is not None and math.isfinite(found[2]):
-            as_rare = float(tail.value(found[2] - SCORE))
+        if tail is not None and math.isfinite(surprises[2]):
+            as_rare = float(tail.value(surprises[2] - SCORE))
         scanned.append(
             ScannedEpisode(
                 one.episode,
@@ -699,13 +711,13 @@ def _verdict(
                 float(q[i]),
                 threshold,
                 odd,
-                shown.row,
-                shown.since,
-                shown.intervals,
-                shown.sensors,
+                detail.row,
+                detail.since,
+                detail.intervals,
+                detail.sensors,
                 faults,
                 band,
-                places[i],
+                positions[i],
                 finding.reason,
             )
         )

@@ -72,7 +72,7 @@ def page(
         A whole document.
     """
     heading = html.escape(title)
-    shown = [s for s in scan.ranked if s.place <= first or s.band != "fine"]
+    notable = [s for s in scan.ranked if s.position <= first or s.band != "fine"]
     head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width">'
     text = [
         f'<!doctype html><html lang="en"><head>{head}<title>{heading}</title>',
@@ -81,14 +81,14 @@ def page(
         *(f'<p class="dim">{html.escape(remark)}</p>' for remark in (*notes, *scan.notes)),
         f'<p class="dim">{_LEGEND}</p>',
     ]
-    drawn = shown[:PICTURES]
+    drawn = notable[:PICTURES]
     for band, name in _HEADINGS.items():
         in_band = [scanned for scanned in drawn if scanned.band == band]
         text += [f'<h2 class="{WORDS[band]}">{name}</h2>'] * bool(in_band)
         text += [_article(scanned, scan, link(scanned)) for scanned in in_band]
-    if len(shown) > PICTURES:
-        text.append(f"<p>And {len(shown) - PICTURES} more without a picture.</p>")
-    text.append(f"<h2>All episodes</h2>{_table(scan, {scanned.place for scanned in drawn})}")
+    if len(notable) > PICTURES:
+        text.append(f"<p>And {len(notable) - PICTURES} more without a picture.</p>")
+    text.append(f"<h2>All episodes</h2>{_table(scan, {scanned.position for scanned in drawn})}")
     return "\n".join([*text, "</body></html>\n"])
 
 
@@ -103,7 +103,7 @@ def _article(scanned: ScannedEpisode, scan: Scan, address: str) -> str:
         about += f' <a href="{html.escape(address)}">Open in Foxglove{row}</a>'
     name = html.escape(scanned.episode.name)
     return (
-        f'<h3 id="episode-{scanned.place}">{scanned.place}. {name}</h3><p>{about}</p>'
+        f'<h3 id="episode-{scanned.position}">{scanned.position}. {name}</h3><p>{about}</p>'
         f'<div class="wide">{picture(scanned, scan)}</div>'
     )
 
@@ -116,8 +116,8 @@ def _table(scan: Scan, drawn: set[int]) -> str:
             f"<td{_class(title)}>{html.escape(text)}</td>"
             for title, text in zip(titles, texts, strict=True)
         ]
-        if scanned.place in drawn:
-            link = f'<a href="#episode-{scanned.place}">{html.escape(scanned.episode.name)}</a>'
+        if scanned.position in drawn:
+            link = f'<a href="#episode-{scanned.position}">{html.escape(scanned.episode.name)}</a>'
             name = f"<td>{link}</td>"
         word = WORDS[scanned.band]
         lines.append(f"<td class={word}>{word}</td>{name}{''.join(others)}")
@@ -171,8 +171,10 @@ def picture(scanned: ScannedEpisode, scan: Scan) -> str:
     for name in list(dict.fromkeys(names))[: min(SENSORS, max(1, len(scanned.suspects)))]:
         values = [other.episode.observations[:, columns[name]] for other in scan.episodes
                   if other is not scanned]  # fmt: skip
-        own = scanned.episode.observations[:, columns[name]]
-        panels.append(_panel(len(panels), own, name, span, scanned, usual=_usual(values, span)))
+        observations = scanned.episode.observations[:, columns[name]]
+        panels.append(
+            _panel(len(panels), observations, name, span, scanned, usual=_usual(values, span))
+        )
     if scanned.intervals:
         statistic = np.where(np.isfinite(scanned.statistic), scanned.statistic, np.nan)
         panels.append(

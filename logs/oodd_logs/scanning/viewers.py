@@ -72,12 +72,12 @@ def write_rerun(scan: Scan, path: Path, first: int = 10) -> None:
     except ImportError:
         raise MissingExtraError(f"a recording for Rerun needs rerun-sdk: {_EXTRA}") from None
     names = _names(scan)
-    tabs = [_tab(scanned, names[scanned.place]) for scanned in scan.ranked[:first]]
+    tabs = [_tab(scanned, names[scanned.position]) for scanned in scan.ranked[:first]]
     with replacing(path) as temporary:
         recording = rr.RecordingStream("oodd-eval scan")
         recording.save(temporary, rr.blueprint.Blueprint(rr.blueprint.Tabs(*tabs)))
         for scanned in scan.episodes:
-            name, time = names[scanned.place], scanned.episode.time
+            name, time = names[scanned.position], scanned.episode.time
 
             def send(entity: tuple[str, ...], rows: Any, columns: Any) -> None:
                 timelines = [rr.TimeColumn("row", sequence=rows)]
@@ -157,7 +157,7 @@ def write_mcap(scan: Scan, path: Path) -> None:
             schemas[kind] = writer.register_schema(f"oodd.{kind}", "jsonschema", schema)
         for scanned in scan.episodes:
             channels = {
-                kind: writer.register_channel(f"/{names[scanned.place]}/{kind}", "json", schema)
+                kind: writer.register_channel(f"/{names[scanned.position]}/{kind}", "json", schema)
                 for kind, schema in schemas.items()
             }
             for t, alarm in enumerate(scanned.alarms.tolist()):
@@ -180,7 +180,7 @@ def _names(scan: Scan) -> dict[int, str]:
     """Return the names of episodes by place, with their number where a name occurs twice."""
     names = [scanned.episode.name for scanned in scan.episodes]
     return {
-        scanned.place: name if names.count(name) == 1 else f"{name} ({i})"
+        scanned.position: name if names.count(name) == 1 else f"{name} ({i})"
         for i, (name, scanned) in enumerate(zip(names, scan.episodes, strict=True))
     }
 

@@ -11,12 +11,12 @@ from oodd_eval.errors import UnknownNameError
 from oodd_eval.plugins.explanations import Explanation
 from oodd_logs.episodes import Episode
 from oodd_logs.scanning.episode_faults import EpisodeFault, breaks_of, clean, gaps
-from oodd_logs.scanning.evidence import Evidence
+from oodd_logs.scanning.evidence import EpisodeEvidence
 
 
 def watched(
     watchdog: Watchdog, episodes: Sequence[Episode], names: Sequence[str]
-) -> list[Evidence]:
+) -> list[EpisodeEvidence]:
     """Let a watchdog judge all episodes, row by row as beside a robot.
 
     Parameters
@@ -30,7 +30,7 @@ def watched(
 
     Returns
     -------
-    list of Evidence
+    list of EpisodeEvidence
     """
     unknown = [name for name in watchdog.sensors if name not in names]
     if unknown:
@@ -49,7 +49,7 @@ def watched(
 
 def _watched(
     watchdog: Watchdog, episode: Episode, longest: float, trajectory: Trajectory
-) -> Evidence:
+) -> EpisodeEvidence:
     rows, sensors = episode.observations.shape
     scores, statistic = np.full((2, rows), np.nan)
     shares, onsets = np.full((rows, sensors), np.nan), np.full(rows, -1)
@@ -67,4 +67,6 @@ def _watched(
         for key in reading.faults.items():
             faults.setdefault(key, t)
     seen = *(EpisodeFault(*key, t) for key, t in faults.items()), *gaps(episode.time, longest)
-    return Evidence(episode, scores, statistic, Explanation(shares, onsets), seen, trajectory)
+    return EpisodeEvidence(
+        episode, scores, statistic, Explanation(shares, onsets), seen, trajectory
+    )
