@@ -107,6 +107,9 @@ def import_recipe(
     for name in (layout.MANIFEST, f"{recipe.environment}.h5"):
         refuse_inputs(directory / name, files_of(recipe, root), "the split's file")
     with read_episodes(recipe, root) as source:
+        for path in _unnamed_files(recipe, root):
+            name = path.relative_to(root).as_posix()
+            source.ledger.add("file", "dropped", "no line names it", source=name)
         (Ledger() if ledger is None else ledger).merge(source.ledger)
         for kind, quantities in (names or {}).items():
             if quantities:
@@ -212,6 +215,15 @@ def _files_of(form: str, part: Path) -> tuple[str, ...]:
 
 def _is_log(path: Path) -> bool:
     return path.name != ONSETS and not path.name.startswith(".")
+
+
+def _unnamed_files(recipe: Recipe, root: Path) -> Iterator[Path]:
+    """Yield files beside those that a recipe names, of the same kind."""
+    named = {path for path in files_of(recipe, root) if path.is_file()}
+    kinds = {path.suffix for path in named}
+    for folder in dict.fromkeys(path.parent for path in sorted(named)):
+        beside = {path for path in folder.iterdir() if path.suffix in kinds and _is_log(path)}
+        yield from sorted(path for path in beside - named if path.is_file())
 
 
 def _test_parts(form: str, folder: Path) -> dict[str, Path]:

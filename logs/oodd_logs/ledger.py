@@ -65,12 +65,13 @@ class LedgerEntry:
 
         `total` is the number of all sources, 0 where that is not known.
         """
-        if len(self.sources) == total > 1:
+        is_counted = self.item != "file"  # their number is said before
+        if is_counted and len(self.sources) == total > 1:
             return f" in all {total}"
         many = f" in {len(self.sources)}{f' of {total}' if total else ''}: "
         names = ", ".join(filter(None, [self.first, *[*self.sources][1:_NAMED]]))
         names += f" and {len(self.sources) - _NAMED} more" * (len(self.sources) > _NAMED)
-        return f"{many if len(self.sources) > 1 else ': '}{names}" if names else ""
+        return f"{many if is_counted and len(self.sources) > 1 else ': '}{names}" if names else ""
 
     def line(self, total: int = 0) -> str:
         """Return the entry as a line of text.

@@ -371,16 +371,20 @@ class StampedRows:
         elif topic in self._stamps:
             times = self._stamps[topic]
             if end <= np.nanmin(times) or begin > np.nanmax(times):
-                columns = [column.column for column in self._selection.times[topic]]
-                cells = self._recorded.recording.topics[topic].read(columns, 0, len(times))
-                rows = np.flatnonzero(np.isfinite(times))[[0, -1]].tolist()
-                first, last = (" ".join(str(cells[name][i]) for name in columns) for i in rows)
-                span = f"the recording, whose first stamp is {first} and its last {last}"
-                expected = f"a part of {span}"
+                expected = f"a part of the recording, whose {self._first_and_last(topic)}"
         if expected:
             anomaly = f"{self._recorded.source}: an anomaly is from {start} to {stop}"
             raise TrajectoryError(f"{anomaly}, expected {expected}")
         return Mark(begin, end, kind)
+
+    def _first_and_last(self, topic: str) -> str:
+        """Return the first and the last stamp of a topic as they are recorded, in words."""
+        columns = [column.column for column in self._selection.times[topic]]
+        rows = self._recorded.recording.topics[topic]
+        cells = rows.read(columns, 0, rows.rows)
+        ends = np.flatnonzero(np.isfinite(self._stamps[topic]))[[0, -1]].tolist()
+        first, last = (" ".join(str(cells[name][i]) for name in columns) for i in ends)
+        return f"first stamp is {first} and its last {last}"
 
     def _position(self, moment: float | str, topic: str, side: str) -> float:
         """Return where a row or time is: in seconds, or rows without stamps."""
@@ -388,9 +392,13 @@ class StampedRows:
         stamps, most = self._stamps.get(topic), count - (side == "begin")
         if isinstance(moment, int):
             if not 0 <= moment <= most:
+                times = ""
+                if stamps is not None and count:
+                    times = f"; a time has a point, as in {moment}.0: the recording's "
+                    times += self._first_and_last(topic)
                 raise TrajectoryError(
                     f"{source}: an anomaly is said to {side} at row {moment}, expected 0 to "
-                    f"{most}, as there are {count} rows"
+                    f"{most}, as there are {count} rows{times}"
                 )
             if stamps is None:
                 return float(moment) if moment < count else np.inf

@@ -8,6 +8,7 @@ import tracemalloc
 import numpy as np
 import pytest
 from helpers_logs import write_table as write
+from oodd_logs.importing import import_recipe
 from oodd_logs.inspection.columns import ClockFacts, ColumnFacts, time_unit
 from oodd_logs.inspection.draft import draft, draft_recipe
 from oodd_logs.inspection.logs import inspect_logs
@@ -311,10 +312,25 @@ def test_equal_files_are_named_and_those_without_a_column_in_common_left_out(tmp
     write(tmp_path / "room.csv", {"temperature": np.random.default_rng(0).normal(20, 1, 50)})
     logs = inspect_logs(tmp_path)
     assert logs.equal == [["a.csv", "c.csv"]]
-    assert "temperature" in topics(logs)["headers"]
+    (entry,) = logs.ledger.of("file", "dropped")
+    assert [*entry.sources] == ["room.csv"]
     recipe = draft_recipe(tmp_path)
     assert recipe.nominal.files == ("a.csv", "b.csv")
     assert recipe.sensors == ("q[rad]", "tau[N m]")
+
+
+def test_what_a_draft_leaves_out_takes_no_part_in_it_and_an_import_says_it(clean, tmp_path_factory):
+    write(clean / "labels.csv", {"filename": ["run-1.csv", "run-2.csv"] * 20, "label": [0, 1] * 20})
+    (clean / "gone.csv").symlink_to(clean / "nowhere.csv")
+    logs = inspect_logs(clean)
+    assert (logs.labels, {*logs.columns}) == ((), {"t", "q[rad]", "tau[N m]"})
+    dropped = {file for entry in logs.ledger.of("file", "dropped") for file in entry.sources}
+    assert dropped == {"labels.csv", "gone.csv"}
+    assert topics(logs).keys() == {"time", "nominal"}
+    report = []
+    output = tmp_path_factory.mktemp("split")
+    import_recipe(draft_recipe(clean), clean, output, report=report.append)
+    assert "dropped: 1 file, no line names it: labels.csv" in report
 
 
 def test_blocks_with_classes_are_sorted_by_kind(tmp_path):

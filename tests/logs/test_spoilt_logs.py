@@ -341,7 +341,7 @@ def test_what_is_spoilt_changes_nothing_or_is_said(form, entrance, seed, clean):
     ("row", "words"),
     [
         (("r25.csv", 7203.0, 7206.0, ""), ("r25.csv", "7203", "first stamp is 0.0", "last 5.9")),
-        (("r25.csv", 600, 700, ""), ("r25.csv", "row 600", "60 rows")),
+        (("r25.csv", 600, 700, ""), ("r25.csv", "row 600", "60 rows", "600.0", "last 5.9")),
         (("r52.csv", 3.0, 6.0, ""), ("r52.csv",)),
     ],
 )

@@ -277,13 +277,9 @@ class Inspection:
     @cached_property
     def roles(self) -> dict[str, str]:
         """Why columns are no sensors, by name: a role, or a kind; empty texts for sensors."""
-        most = max((facts.cells for facts in self.columns.values()), default=0)
         usable = (recording for recording in self.recordings if recording.file in self.usable)
-        roles, partial = {**self._basic_roles}, {n for r in usable for n in self._lacking(r)}
-        for name in self._candidates:
-            slow = "slow" if self.columns[name].cells < SLOW * most else ""
-            roles[name] = "partial" if name in partial else slow
-        return roles
+        partial = {n for r in usable for n in self._lacking(r) & self._candidates}
+        return self._basic_roles | dict.fromkeys(partial, "partial")
 
     @cached_property
     def _basic_roles(self) -> dict[str, str]:
@@ -299,6 +295,9 @@ class Inspection:
                 of_kinds |= dict.fromkeys(names, "" if kinds()[kind].sensor else kind)
                 together |= {*names} if len(names) > 1 else set()
 
+        rows = {name: c.cells / max(1, c.recordings) for name, c in self.columns.items()}
+        fewest = SLOW * max(rows.values(), default=0)
+
         def role(name: str, facts: ColumnFacts) -> str:
             roles = [role for role, names in names_by_role.items() if name in names]
             roles += [role for role in ("empty", "text") if getattr(facts, role)]
@@ -306,7 +305,8 @@ class Inspection:
                 return (roles or [""])[0]
             if facts.constant:
                 return "constant"
-            return of_kinds.get(name) or ("setpoints" if facts.set_point else "")
+            slow = "slow" if rows[name] < fewest else ""
+            return of_kinds.get(name) or ("setpoints" if facts.set_point else slow)
 
         return {name: role(name, facts) for name, facts in self.columns.items()}
 
@@ -373,7 +373,8 @@ class Inspection:
         there = {recording.file for recording in self.recordings}
         for file in (f for f in files if f not in {*there, *self.unreadable, self.intervals}):
             self.unreadable.append(file)
-            self.ledger.add("file", "dropped", "no rows", source=file)
+            reason = "a broken link" if (self.path / file).is_symlink() else "no rows"
+            self.ledger.add("file", "dropped", reason, source=file)
         for file, name in (pair for pair in self._rowless if pair[0] in there):
             self.ledger.add("recording", "dropped", "no rows", source=f"{file}, {name}")
         self._name_columns()
@@ -383,8 +384,10 @@ class Inspection:
                     at: dict[str, Any] = {"source": source, "row": row, "cell": cell}
                     fate = EXCEPTIONS[reason]
                     self.ledger.add("cell", fate, reason, name=name, count=count, **at)
-        for recording in (r for r in self.recordings if r.file not in self.usable):
-            lacking, file = self._lacking(recording), recording.file
+        usable = {*self.usable}
+        used = {n for r in self.recordings if r.file in usable for n in r.columns}
+        for recording in (r for r in self.recordings if r.file not in usable):
+            lacking, file = self._lacking(recording) & used, recording.file
             for name in sorted(lacking & recording.empty):
                 self.ledger.add("column", "kept", "no number in it", name=name, source=file)
             if lacking - recording.empty:
@@ -392,6 +395,11 @@ class Inspection:
                 instead = {n: units.get(plain_name(n)) for n in sorted(lacking - recording.empty)}
                 lacks = [f"{n} (it has {other})" if other else n for n, other in instead.items()]
                 self.ledger.add("file", "dropped", f"it lacks {listed(lacks)}", source=file)
+        if self.columns.keys() - used:
+            # What only files have that are left out takes no part.
+            self.columns = {n: facts for n, facts in self.columns.items() if n in used}
+            for name in ("times", "_stuck", "labels", "kinds", "_basic_roles", "roles"):
+                self.__dict__.pop(name, None)
         for name, role in self.roles.items():
             if role and role not in {"times", "labels"}:
                 self.ledger.add("column", "dropped", role_of(role).reason, name=name)
@@ -583,7 +591,9 @@ def inspect_logs(
     shared = Counter(r.file for r in result.recordings if len({*with_rows[r.digest]}) > 1)
     result.shared = {file: n for file, n in shared.items() if file not in equal}
     result.continued = _continued(result.recordings)
-    result.settle([*order])
+    # What a glob would match.
+    links = (link for link in path.rglob("*") if not link.exists() and reader.fits(link))
+    result.settle([*order, *(link.relative_to(path).as_posix() for link in links)])
     return result
 
 
@@ -659,6 +669,7 @@ def _continued(recordings: Sequence[RecordingFacts]) -> list[tuple[str, str, int
         for rows in [recording.tail[i:]]
         for other in beginning[int(rows[0])]
         if len(rows) >= _OVERLAP
+        and other is not recording
         and not len(rows) == recording.length == other.length
         and np.array_equal(rows, other.head[: len(rows)])
     ]

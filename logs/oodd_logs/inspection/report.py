@@ -88,9 +88,11 @@ def _of_files(logs: Inspection) -> Iterator[Advice]:
     if logs.transposed:
         text = f"rows and columns of {listed(logs.transposed)} are exchanged (and were read so): "
         yield Advice("transposed", f"{text}write transpose = {toml(logs.transposed)} below [read]")
-    headers = Counter(r.columns for r in logs.recordings)
+    usable = {*logs.usable}
+    headers = Counter(frozenset(r.columns) for r in logs.recordings if r.file in usable)
     if len(headers) > 1:
-        partial = [n for n, c in logs.columns.items() if c.recordings < len(logs.recordings)]
+        in_all = frozenset.intersection(*headers)
+        partial = [name for name in logs.columns if name not in in_all]
         sizes = ", ".join(f"{len(names)} columns in {n}" for names, n in headers.most_common(3))
         text = f"episodes differ in their columns ({sizes}): not in all, as sensors have to be: "
         yield Advice("headers", text + listed(partial))
