@@ -401,7 +401,7 @@ class _Block:
         elif row[0].strip() in header and sorted(map(str.strip, row)) == sorted(header):
             reason = "the header again"
             if tuple(map(str.strip, row)) != header:
-                raise TrajectoryError(f"{self._place(i)} is a header of another order: split it")
+                raise TrajectoryError(f"{self._position(i)} is a header of another order: split it")
         else:
             return True
         self.ledger.add("row", "dropped", reason, cell=self.layout.separator.join(row))
@@ -416,10 +416,10 @@ class _Block:
             return row + [""] * (width - len(row))
         if len(row) > width and not any(row[width:]):
             return row[:width]
-        problem = f"{self._place(i)} has {len(row)} cells, expected {width}: {', '.join(names)}"
+        problem = f"{self._position(i)} has {len(row)} cells, expected {width}: {', '.join(names)}"
         raise TrajectoryError(problem[:600])
 
-    def _place(self, i: int) -> str:
+    def _position(self, i: int) -> str:
         line = self.line + _line_of(self.text, i, self.layout.separator)
         return f"{self.path}, line {line}"
 
