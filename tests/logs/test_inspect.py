@@ -509,3 +509,19 @@ def test_an_outcome_and_a_task_of_each_episode_are_named(tmp_path):
     assert remarks.keys() == {"time", "fields"}
     recipe = draft_recipe(tmp_path)
     assert (recipe.outcome, recipe.task) == ("success", "task_id")
+
+
+def test_a_header_of_very_many_numbered_names_is_no_matrix(tmp_path):
+    names = [f"x{i}" for i in range(300)]
+    lines = [",".join(names), *(",".join(f"{i * k % 7}.5" for i in range(300)) for k in range(20))]
+    (tmp_path / "wide.csv").write_text("\n".join(lines) + "\n")
+    logs = inspect_logs(tmp_path)
+    assert (logs.transposed, len(logs.columns)) == ([], 300)
+
+
+def test_a_long_table_is_said_to_mix_values(tmp_path):
+    lines = [f"{i},{('p', 'q')[i % 2]},{i * i % 11}.5" for i in range(60)]
+    for name, said in (("tag", 1), ("mode", 0)):
+        (tmp_path / "long.csv").write_text("\n".join([f"time,{name},value", *lines]) + "\n")
+        kept = inspect_logs(tmp_path).ledger.of("column", "kept")
+        assert [e.name for e in kept if "each row of value" in e.reason] == [name] * said

@@ -51,6 +51,11 @@ _FIRST: Final = 8  # columns of which the first row may count like a clock
 _ENDS: Final = 2000  # rows at either end of a recording that are compared with others
 _OVERLAP: Final = 20  # rows that two recordings have to share
 _PRIME: Final = np.uint64(0x100000001B3)
+_TAG: Final = re.compile(
+    r"(.*[_. ])?(tag|topic|variable|signal|sensor|parameter|channel|metric|measurement|point)"
+    r"([_. ]?(name|id))?",
+    re.IGNORECASE,
+)
 _LABEL: Final = re.compile(
     r"anomal|fault|fail|label|health|attack|alarm|error|class|status|stop|lost|binary"
     r"|outlier|novelty|defect",
@@ -404,6 +409,13 @@ class Inspection:
             if role and role not in {"times", "labels"}:
                 self.ledger.add("column", "dropped", role_of(role).reason, name=name)
         kept = functools.partial(self.ledger.add, "column", "kept")
+        sensors = [name for name, role in self.roles.items() if not role]
+        for name, facts in self.columns.items():
+            # A long table has a row for each value of one of several things.
+            several = facts.text and (facts.values is None or len(facts.values) > 1)
+            if several and len(sensors) < 2 and _TAG.fullmatch(name):
+                mixed = ", ".join(sensors) or "other columns"
+                kept(f"it says of what each row of {mixed} is: write a column for each", name=name)
         for name in self.columns:
             stem, unit = split_unit(name)
             if unit and names_time(stem) and not unit_of(unit):
@@ -562,6 +574,7 @@ def inspect_logs(
                 # Those of a matrix, or of a text without a header, are numbered.
                 stems = {re.sub(r"\d+(\[.*\])?$", "", name) for name in columns}
                 is_matrix = len(recording.topics) == len(stems) == 1 < len(columns)
+                is_matrix &= "header" not in reader.options or stems == {""}
                 if is_matrix and not result.episode and "transpose" in reader.options:
                     later.append((file, recording))
                     continue
