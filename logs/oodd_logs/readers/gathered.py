@@ -166,10 +166,10 @@ class Gathered:
         shapes = {block.shape[1:] for _, block in parts} - {(0,)}
         if len(shapes) > 1:
             self._fates[plain, number_lists.KIND.words] = False
-            folded = [(places, number_lists.figures(plain, block)) for places, block in parts]
+            made = [number_lists.figures(plain, block) for _, block in parts]
             return {
-                label: self._column([(places, of_figures[label]) for places, of_figures in folded])
-                for label in folded[0][1]
+                label: self._column([(p, m[label]) for (p, _), m in zip(parts, made, strict=True)])
+                for label in made[0]
             }
         columns = {}
         for first, *more in np.ndindex(*next(iter(shapes), (0,))):
@@ -206,11 +206,9 @@ def _unpacked(value: Any) -> Any:
         return [*value]
     if isinstance(value, list) and value and isinstance(value[0], tuple):
         return dict(value)  # as PyArrow returns maps
-    if isinstance(value, SimpleNamespace) and hasattr(value, "__slots__"):
-        return {key: getattr(value, key) for key in value.__slots__}
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        names = (f.name for f in dataclasses.fields(value) if not f.name.startswith("__"))
-        return {key: getattr(value, key) for key in names}
+    if isinstance(value, SimpleNamespace) or dataclasses.is_dataclass(value):
+        names = getattr(value, "__slots__", None) or value.__dataclass_fields__
+        return {key: getattr(value, key) for key in names if not key.startswith("__")}
     return value
 
 

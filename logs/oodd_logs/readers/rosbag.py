@@ -1,6 +1,7 @@
 """Bags of ROS 2, directories with a database or MCAP files, and of ROS 1, files."""
 
 import contextlib
+import functools
 import io
 import itertools
 import re
@@ -30,25 +31,24 @@ def _open(path: Path, options: Options) -> Iterator[Recording]:
     databases = sorted(path.glob("*.db3"), key=lambda file: in_order(file.name))
     if path.suffix.lower() == ".db3":
         databases = [path]
-    if not databases or (path / "metadata.yaml").exists():
-        bag = library(f"rosbags.rosbag{1 + path.is_dir()}").Reader(path)
-        try:
-            bag.open()
-        except Exception:
-            if path.is_dir() and not databases:
-                raise
-        else:
-            with contextlib.closing(bag):
-                yield _recording(path, path, options, bag.connections, bag.messages, Ledger())
-            return
-    ledger = Ledger()
-    ledger.add("recording", "changed", RECOVERED)
-    if not databases:
-        connections, messages = _unindexed(path)
-        yield _recording(path, path, options, connections, messages, ledger)
-    # Parts of one recording are numbered.
-    for _, files in itertools.groupby(databases, lambda file: re.sub(r"_\d+$", "", file.stem)):
-        with contextlib.ExitStack() as stack:
+    with contextlib.ExitStack() as stack:
+        if not databases or (path / "metadata.yaml").exists():
+            bag = library(f"rosbags.rosbag{1 + path.is_dir()}").Reader(path)
+            try:
+                bag.open()
+            except Exception:
+                if path.is_dir() and not databases:
+                    raise
+            else:
+                stack.callback(bag.close)
+                yield _recording(path, options, bag.connections, bag.messages, Ledger())
+                return
+        ledger = Ledger()
+        ledger.add("recording", "changed", RECOVERED)
+        if not databases:
+            yield _recording(path, options, *_unindexed(path), ledger)
+        # Parts of one recording are numbered.
+        for _, files in itertools.groupby(databases, lambda file: re.sub(r"_\d+$", "", file.stem)):
             parts = []
             for file in files:
                 parts.append(library("rosbags.rosbag2.storage_sqlite3").Sqlite3Reader(file))
@@ -56,16 +56,12 @@ def _open(path: Path, options: Options) -> Iterator[Recording]:
                 stack.callback(parts[-1].close)
             source = file if len(parts) < len(databases) else path
             connections = [c for part in parts for c in part.connections]
-            yield _recording(source, path, options, connections, _joined(parts), ledger)
+            messages = functools.partial(_joined, parts)
+            yield _recording(source, options, connections, messages, ledger)
 
 
 def _recording(
-    source: Path,
-    path: Path,
-    options: Options,
-    connections: Sequence[Any],
-    read: Messages,
-    ledger: Ledger,
+    path: Path, options: Options, connections: Sequence[Any], read: Messages, ledger: Ledger
 ) -> Recording:
     """Return the messages of a bag, by its connections."""
     selected = chosen(dict.fromkeys(c.topic for c in connections), options)
@@ -76,19 +72,15 @@ def _recording(
     decode = store.deserialize_ros1 if path.suffix.lower() == ".bag" else store.deserialize_cdr
     messages = read([c for c in connections if c.topic in topics])
     decoded = ((c.topic, stamp, decode(raw, c.msgtype)) for c, stamp, raw in messages)
-    return recording_of(source, options, topics, decoded, ledger)
+    return recording_of(path, options, topics, decoded, ledger)
 
 
-def _joined(parts: Sequence[Any]) -> Messages:
-    """Return the messages of databases, each up to where it breaks."""
-
-    def messages(connections: Sequence[Any]) -> Iterator[tuple[Any, int, bytes]]:
-        for part in parts:
-            owned = [c for c in connections if c in part.connections]
-            with contextlib.suppress(library("apsw").Error):
-                yield from part.messages(owned) if owned else ()
-
-    return messages
+def _joined(parts: Sequence[Any], connections: Sequence[Any]) -> Iterator[tuple[Any, int, bytes]]:
+    """Yield the messages of databases, each up to where it breaks."""
+    for part in parts:
+        owned = [c for c in connections if c in part.connections]
+        with contextlib.suppress(library("apsw").Error):
+            yield from part.messages(owned) if owned else ()
 
 
 def _unindexed(path: Path) -> tuple[list[Any], Messages]:

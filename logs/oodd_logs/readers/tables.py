@@ -44,8 +44,7 @@ OPTIONS: Final = {
 _BLOCK: Final = 2**22  # characters
 _PIECE: Final = 2**16
 _SAMPLE: Final = 100  # lines from which the layout is recognised
-_DECIMAL_COMMA: Final = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
-_DECIMAL_POINT: Final = re.compile(r"[+-]?\d*\.\d+([eE][+-]?\d+)?")
+_DECIMAL: Final = re.compile(r"[+-]?\d*([.,])\d+([eE][+-]?\d+)?")
 _THREE_DIGITS: Final = re.compile(r"[+-]?[1-9]\d{0,2}([.,]\d{3})+")
 _ZEROS: Final = re.compile("\0+")
 _LAST: Final = ("action:", "reward", "column ")  # what a last row may lack
@@ -328,15 +327,16 @@ def _without_zeros(text: str, ledger: Ledger) -> str:
     """
     if "\0" not in text:
         return text
-    lines = text.splitlines(keepends=True)
-    for i, line in enumerate(lines):
-        head, _, rest = line.lstrip("\0").partition("\0")
-        if head.strip() and (rest or "\0" in line.lstrip("\0")):
-            ledger.add("row", "dropped", "zero bytes are in its line", cell=head)
-        if "\0" in line:
-            lines[i] = line.lstrip("\0") if "\0" not in line.lstrip("\0") else "\n"
+    kept = []
+    for line in text.splitlines(keepends=True):
+        plain = line.lstrip("\0")
+        if "\0" in plain:
+            if (head := plain.partition("\0")[0]).strip():
+                ledger.add("row", "dropped", "zero bytes are in its line", cell=head)
+            plain = "\n"
+        kept.append(plain)
     ledger.add("file", "changed", "zero bytes are left out")
-    return "".join(lines)
+    return "".join(kept)
 
 
 @dataclass(frozen=True, slots=True)
@@ -489,9 +489,9 @@ def _decimal(rows: Sequence[Sequence[str]], separator: str, options: Options) ->
         return "."
     # A mark before three digits may stand between thousands.
     cells = {cell.strip() for row in rows for cell in row}
-    cells = {cell for cell in cells if not _THREE_DIGITS.fullmatch(cell)}
-    points, commas = (any(map(p.fullmatch, cells)) for p in (_DECIMAL_POINT, _DECIMAL_COMMA))
-    return "." if points else "," if commas else ""
+    matches = [_DECIMAL.fullmatch(cell) for cell in cells if not _THREE_DIGITS.fullmatch(cell)]
+    marks = {match[1] for match in matches if match}
+    return "." if "." in marks else "".join(marks)
 
 
 def _names(options: Options, names: Sequence[str], path: Path) -> tuple[str, ...]:
