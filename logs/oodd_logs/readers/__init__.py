@@ -195,12 +195,12 @@ def library(module: str, extra: str = "logs") -> Any:
     """
     try:
         return importlib.import_module(module)
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         package = module.partition(".")[0]
-        if isinstance(error, ModuleNotFoundError) and (error.name or "").startswith(package):
-            advice = f"pip install 'oodd-eval[{extra}]'"
-            raise MissingExtraError(f"these logs need {package}: {advice}") from None
-        raise
+        if not (error.name or "").startswith(package):
+            raise
+        advice = f"pip install 'oodd-eval[{extra}]'"
+        raise MissingExtraError(f"these logs need {package}: {advice}") from None
 
 
 @contextlib.contextmanager

@@ -107,11 +107,7 @@ class Gathered:
         elif isinstance(value, Mapping):
             prefix = f"{name}." if name else ""
             for key, inner in value.items():
-                label = f"{prefix}{key}"
-                if type(inner) in _PLAIN:
-                    row[label] = inner
-                else:
-                    self._put(label, inner, row, depth + 1)
+                self._put(f"{prefix}{key}", inner, row, depth + 1)
         elif isinstance(value, list | tuple | np.ndarray):
             self._put_list(name, value, row, depth)
         else:
@@ -139,7 +135,7 @@ class Gathered:
                 if _MARK in name:
                     self._keep_lists(name, places, cells)
                 elif str in {*map(type, cells)}:
-                    words = [c if isinstance(c, str) else _text(c) for c in cells]
+                    words = [*map(_text, cells)]
                     self._keep(name, places, words, sum(map(len, words)))
                 else:
                     self._keep(name, places, np.array(cells, np.float64), 8 * len(cells))
@@ -189,13 +185,15 @@ class Gathered:
         cells = [""] * self.rows
         for places, values in parts:
             for row, cell in zip(places.tolist(), values, strict=True):
-                cells[row] = cell if isinstance(cell, str) else _text(cell)
+                cells[row] = _text(cell)
         words = numbers(cells)
         return texts(cells, self.source) if words is None else words
 
 
-def _text(number: float | None) -> str:
-    return "" if number is None or math.isnan(number) else f"{number:.15g}"
+def _text(cell: str | float | None) -> str:
+    if isinstance(cell, str):
+        return cell
+    return "" if cell is None or math.isnan(cell) else f"{cell:.15g}"
 
 
 def _unpacked(value: Any) -> Any:

@@ -158,7 +158,7 @@ def _columns(names: Sequence[str], facts: Facts, source: str) -> dict[str, str]:
             feature, item = name, ""
         if feature in _COUNTERS:
             continue
-        items = _flat(features.get(feature, {}).get("names")) if feature in features else []
+        items = _flat(features.get(feature, {}).get("names"))
         position = int(item) if item else 0
         inner = items[position] if position < len(items) and (item or len(items) == 1) else item
         labels[name] = _label(feature, str(inner))
@@ -170,12 +170,10 @@ def _label(feature: str, item: str) -> str:
     if feature in {"reward", "next.reward"}:
         return "reward"
     head, _, rest = feature.partition(".")
-    if head not in {"observation", "action"}:
-        return f"{feature}.{item}" if item else feature
-    kind = "obs" if head == "observation" else head
-    if rest in {"", "state"} and not item.isdigit():
-        return f"{kind}:{item or rest or head}"
-    return f"{kind}:{rest or head}.{item}" if item else f"{kind}:{rest}"
+    is_named = rest in {"", "state"} and item and not item.isdigit()
+    label = item if is_named else ".".join(filter(None, (rest or head, item)))
+    kind = {"observation": "obs", "action": "action"}.get(head)
+    return f"{kind}:{label}" if kind else ".".join(filter(None, (feature, item)))
 
 
 def _flat(names: Any) -> list[str]:

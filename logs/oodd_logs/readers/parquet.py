@@ -228,19 +228,8 @@ def _values(array: Any, leaf: _Leaf, path: Path) -> Column:
     pa, compute = library("pyarrow"), library("pyarrow.compute")
     types = pa.types
     for step in leaf.path:
-        if isinstance(step, str):
-            array = compute.struct_field(array, step)
-        elif types.is_fixed_size_list(array.type):
-            array = compute.list_element(array, step)
-        else:
-            lengths = compute.list_value_length(array)
-            bounds = compute.min_max(lengths).as_py()
-            if bounds["min"] is not None and bounds["min"] <= step:
-                raise TrajectoryError(
-                    f"{path}, column {leaf.column!r}: lists have from {bounds['min']} to "
-                    f"{bounds['max']} items, expected as many as in the first row"
-                )
-            array = compute.list_element(array, step)
+        inner = compute.struct_field if isinstance(step, str) else compute.list_element
+        array = inner(array, step)
     if leaf.figure:
         rows, owners = len(array), np.arange(len(array))
         while hasattr(array.type, "value_type"):

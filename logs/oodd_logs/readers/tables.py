@@ -244,17 +244,10 @@ def layout_of(path: Path, options: Options, separator: str = "") -> Layout:
     thousands = option(options, "thousands", None, marks.__contains__, expected)
     if thousands and decimal in {thousands, ""}:
         decimal = "," if thousands == "." else "."
+    thousands = "" if thousands is False else thousands
     written = tuple(map(str.strip, head)) if header else ()
-    return Layout(
-        separator,
-        decimal,
-        encoding,
-        first,
-        _names(options, names, path),
-        "" if thousands is False else thousands,
-        tuple(units),
-        written,
-    )
+    labels = _names(options, names, path)
+    return Layout(separator, decimal, encoding, first, labels, thousands, tuple(units), written)
 
 
 def _units(rows: Sequence[Sequence[str]], decimal: str) -> list[str]:
@@ -265,14 +258,12 @@ def _units(rows: Sequence[Sequence[str]], decimal: str) -> list[str]:
 
     units, below = [cell.strip() for cell in rows[1]] if len(rows) > 2 else [], rows[2:]
     words = [i for i, cell in enumerate(units) if cell not in {"", "-", "1"}]
-    if len(units) > len(rows[0]) or any(
-        is_value(units[i]) or read_texts([units[i]]) for i in words
-    ):
-        return []
+    is_line = len(units) <= len(rows[0])
+    is_line &= not any(is_value(units[i]) or read_texts([units[i]]) for i in words)
     columns = {i: [row[i] for row in below if i < len(row) and row[i].strip()] for i in words}
     numeric = [i for i in words if columns[i] and all(map(is_value, columns[i]))]
     repeated = any(units[i] in map(str.strip, columns[i]) for i in words)
-    return units if numeric and 2 * len(numeric) >= len(words) and not repeated else []
+    return units if is_line and numeric and 2 * len(numeric) >= len(words) and not repeated else []
 
 
 def _with_unit(name: str, unit: str) -> str:
