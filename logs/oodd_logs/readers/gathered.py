@@ -107,7 +107,10 @@ class Gathered:
         elif isinstance(value, Mapping):
             prefix = f"{name}." if name else ""
             for key, inner in value.items():
-                self._put(f"{prefix}{key}", inner, row, depth + 1)
+                if type(inner) in _PLAIN:  # most are
+                    row[f"{prefix}{key}"] = inner
+                else:
+                    self._put(f"{prefix}{key}", inner, row, depth + 1)
         elif isinstance(value, list | tuple | np.ndarray):
             self._put_list(name, value, row, depth)
         else:
