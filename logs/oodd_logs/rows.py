@@ -99,6 +99,7 @@ class TopicRows:
             first = self._position = int(firsts.max(initial=0))
             late = self._columns[int(firsts.argmax())] if first else ""
             self._say("row", "dropped", "before the first value", name=late, count=first, row=0)
+            self._hold_before(first)
             return np.arange(first, self._count - (self._policy == "keep" and self._ending()))
         dropped = np.diff(kept) - 1
         if dropped.max(initial=0) > self._most:
@@ -107,6 +108,14 @@ class TopicRows:
         count, row = self._count - len(kept), int(complete.argmin())
         self._say("row", "dropped", "missing values", count=count, row=row)
         return kept
+
+    def _hold_before(self, first: int) -> None:
+        """Take the last values of rows that are dropped, for columns without one in the next."""
+        for start in range(0, first, self._step):
+            cells = self._cells(start, min(start + self._step, first))
+            rows = np.where(np.isfinite(cells), np.arange(len(cells))[:, None], -1).max(axis=0)
+            self._last = np.where(rows < 0, self._last, cells[rows, np.arange(len(rows))])
+            self._runs = np.where(rows < 0, self._runs + len(cells), len(cells) - 1 - rows)
 
     def _ending(self) -> int:
         """Return how many last rows lack values of some columns, as where a logger was ended."""
