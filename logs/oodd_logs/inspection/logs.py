@@ -403,7 +403,15 @@ class Inspection:
         if self.columns.keys() - used:
             # What only files have that are left out takes no part.
             self.columns = {n: facts for n, facts in self.columns.items() if n in used}
-            for name in ("times", "_stuck", "labels", "kinds", "_basic_roles", "roles"):
+            for name in (
+                "times",
+                "_stuck",
+                "labels",
+                "kinds",
+                "_basic_roles",
+                "_candidates",
+                "roles",
+            ):
                 self.__dict__.pop(name, None)
         for name, role in self.roles.items():
             if role and role not in {"times", "labels"}:
