@@ -18,7 +18,7 @@ from oodd_logs.recording import Column, Topic
 _KINDS: Final = "fiub"
 _LONGEST_FIELD: Final = 1000  # items
 
-_Place = tuple[int, ...] | str  # of a number in a row, or the figure of all of them
+_Index = tuple[int, ...] | str  # of a number in a row, or the figure of all of them
 
 
 class MatrixRows(Protocol):
@@ -76,7 +76,7 @@ def episode_of(
         listed = ", ".join(arrays) or "nothing"
         expected = "arrays with a row a step, such as observations"
         raise TrajectoryError(f"{source} holds {listed}, expected {expected}")
-    parts: dict[str, tuple[str, _Place]] = {}
+    parts: dict[str, tuple[str, _Index]] = {}
     fields: dict[str, Any] = {}
     ledger = Ledger()
     for name, array in arrays.items():
@@ -101,7 +101,7 @@ def episode_of(
     labels = dict(zip(column_names(parts), parts.values(), strict=True))
 
     def read(selected: Sequence[str], start: int, stop: int) -> dict[str, Column]:
-        blocks = {}
+        blocks: dict[str, Any] = {}
         for name in {labels[label][0] for label in selected}:
             array = arrays[name]
             size = array.dtype.itemsize * math.prod(array.shape[1:]) * (stop - start)
@@ -122,7 +122,7 @@ def episode_of(
     return Topic(tuple(labels), rows, read), fields, ledger
 
 
-def _places(name: str, array: MatrixRows, ledger: Ledger) -> Sequence[_Place]:
+def _places(name: str, array: MatrixRows, ledger: Ledger) -> Sequence[_Index]:
     """Return the columns of an array: places in a row, figures, or none of an image."""
     size = math.prod(array.shape[1:])
     if len(array.shape) < 3 or size <= number_lists.LONGEST:
@@ -135,7 +135,7 @@ def _places(name: str, array: MatrixRows, ledger: Ledger) -> Sequence[_Place]:
 
 
 def _label(
-    name: str, kind: str, index: _Place, array: MatrixRows, quantities: Sequence[Quantity]
+    name: str, kind: str, index: _Index, array: MatrixRows, quantities: Sequence[Quantity]
 ) -> str:
     """Return the name of a column; observations and actions have those of quantities, if any."""
     if kind == "reward":
