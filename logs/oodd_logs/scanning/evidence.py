@@ -79,9 +79,11 @@ class Readings(NamedTuple):
 
     @property
     def surprise(self) -> Floats:
-        """The surprise of every row, in which being at an end of a range is none."""
-        # A beam that meets nothing and a hand that is closed stay there.
-        start = np.where(np.array(KINDS) == "saturated", np.inf, self.scale.tails.start)
+        """The surprise of every row, in which being at an end of a range or beyond is none."""
+        # A beam that meets nothing and a hand that is closed stay there; how far a sensor is from
+        # its range is among the figures of the episode.
+        is_muted = np.isin(KINDS, ["saturated", "out of range"])
+        start = np.where(is_muted, np.inf, self.scale.tails.start)
         muted = replace(self.scale, tails=self.scale.tails._replace(start=start))
         return muted.surprise(self.rows, self.judged)
 
@@ -322,7 +324,7 @@ def evidence_of(
         surprises[i] = tails[0], faults, tails[1]
         beyond = []
         for x in (largest, distances):
-            unit = mean_beyond(x[others], MOST_ODD)
+            unit = mean_beyond(x[others], MOST_ODD) or mean_beyond(x[others], 0.0)
             with np.errstate(invalid="ignore"):  # infinite ones
                 beyond.append((x[i] - np.median(x[others])) / unit if unit > 0 else 0.0)
         excesses[i] = beyond[0], faults, beyond[1]

@@ -151,8 +151,7 @@ def mean_beyond(values: Floats, odd: float = ODD_SHARE) -> float:
     n, middle = len(ordered), (len(ordered) + 1) // 2
     above = ordered[middle:] - ordered[middle - 1 : middle]
     seen = max(1, math.floor((1 - odd) * n) - middle)
-    censored = np.minimum(above, above[seen - 1 : seen].max(initial=0.0)).sum() / seen
-    return float(censored or above.mean() if len(above) else 0.0)
+    return float(np.minimum(above, above[seen - 1 : seen].max(initial=0.0)).sum() / seen)
 
 
 def rank_p(largest: float, others: Floats, weights: Floats | None = None) -> float:
