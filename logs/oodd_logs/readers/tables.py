@@ -259,7 +259,8 @@ def _units(rows: Sequence[Sequence[str]], decimal: str) -> list[str]:
     units, below = [cell.strip() for cell in rows[1]] if len(rows) > 2 else [], rows[2:]
     words = [i for i, cell in enumerate(units) if cell not in {"", "-", "1"}]
     is_line = len(units) <= len(rows[0])
-    is_line &= not any(is_value(units[i]) or read_texts([units[i]]) for i in words)
+    if any(is_value(units[i]) or read_texts([units[i]]) for i in words):
+        words = []
     columns = {i: [row[i] for row in below if i < len(row) and row[i].strip()] for i in words}
     numeric = [i for i in words if columns[i] and all(map(is_value, columns[i]))]
     repeated = any(units[i] in map(str.strip, columns[i]) for i in words)
@@ -281,7 +282,8 @@ def _blocks(path: Path, layout: Layout, ledger: Ledger) -> Iterator["_Block"]:
             # In pieces: reading reserves as much memory as it is asked for.
             pieces = [*itertools.islice(iter(lambda: file.read(_PIECE), ""), -(-_BLOCK // _PIECE))]
             last = sum(map(len, pieces)) < _BLOCK
-            text = "".join(_ZEROS.sub("\0", piece) for piece in [*pieces, _line(file, path)])
+            pieces.append(_line(file, path))
+            text = "".join(_ZEROS.sub("\0", p) if "\0" in p else p for p in pieces)
             del pieces
             extra = len(text) + LINE_CHARACTERS
             # A line may end within quotes.
@@ -291,9 +293,10 @@ def _blocks(path: Path, layout: Layout, ledger: Ledger) -> Iterator["_Block"]:
             # The last row may lack cells: nothing is commanded after the last observation.
             end = len(text.rstrip(f"\r\n {layout.separator}")) if last else 0
             start = text.rfind("\n", 0, end) + 1 if last else len(text)
-            if not text[:start].strip() or (last and text.count('"', 0, start) % 2):
-                start = 0 if last else start
-            for part, is_last in ((text[:start], False), (text[start:], last)):
+            body, rest = text[:start], text[start:]
+            if last and (not body or body.isspace() or body.count('"') % 2):
+                body, rest = "", text
+            for part, is_last in ((body, False), (rest, last)):
                 if part:
                     yield _Block(path, layout, part, line, is_last, ledger)
                 line += part.count("\n")
