@@ -364,10 +364,12 @@ class _Block:
             if {*map(len, plain)} == {width}:
                 rows = plain
                 self.ledger.add("row", "changed", "a quote that is never closed stands for itself")
-        rows = [row for i, row in enumerate(rows) if self._is_kept(row, i)]
-        for i, row in enumerate(rows):
-            if len(row) != width:
-                rows[i] = self._fitted(row, i, self.last and i == len(rows) - 1)
+        end = len(rows) - 1 if self.last else -1
+        rows = [
+            row if len(row) == width else self._fitted(row, i, i == end)
+            for i, row in enumerate(rows)
+            if self._is_kept(row, i)
+        ]
         columns: list[_Cells] = []
         for i, cells in enumerate(zip(*rows, strict=True)):
             column = None if i in worded else numbers(cells, layout.decimal, strict=True)
@@ -484,8 +486,8 @@ def _decimal(rows: Sequence[Sequence[str]], separator: str, options: Options) ->
     # A mark before three digits may stand between thousands.
     cells = {cell.strip() for row in rows for cell in row}
     matches = [_DECIMAL.fullmatch(cell) for cell in cells if not _THREE_DIGITS.fullmatch(cell)]
-    marks = {match[1] for match in matches if match}
-    return "." if "." in marks else "".join(marks)
+    decimals = {match[1] for match in matches if match}
+    return "." if "." in decimals else "".join(decimals)
 
 
 def _names(options: Options, names: Sequence[str], path: Path) -> tuple[str, ...]:
