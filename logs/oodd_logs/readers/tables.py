@@ -289,16 +289,18 @@ def _blocks(path: Path, layout: Layout, ledger: Ledger) -> Iterator["_Block"]:
             # A line may end within quotes.
             while text.count('"') % 2 and len(text) < extra and (more := file.readline(2**16)):
                 text += more
-            text = _without_zeros(text, ledger)
-            # The last row may lack cells: nothing is commanded after the last observation.
-            end = len(text.rstrip(f"\r\n {layout.separator}")) if last else 0
-            start = text.rfind("\n", 0, end) + 1 if last else len(text)
-            body, rest = text[:start], text[start:]
-            if last and (not body or body.isspace() or body.count('"') % 2):
-                body, rest = "", text
-            for part, is_last in ((body, False), (rest, last)):
+            parts = [_without_zeros(text, ledger)]
+            del text
+            if last:
+                # The last row may lack cells: nothing is commanded after the last observation.
+                end = len(parts[0].rstrip(f"\r\n {layout.separator}"))
+                start = parts[0].rfind("\n", 0, end) + 1
+                if parts[0][:start].strip() and parts[0].count('"', 0, start) % 2 == 0:
+                    parts = [parts[0][:start], parts[0][start:]]
+            while parts:
+                part = parts.pop(0)
                 if part:
-                    yield _Block(path, layout, part, line, is_last, ledger)
+                    yield _Block(path, layout, part, line, last and not parts, ledger)
                 line += part.count("\n")
 
 
