@@ -156,10 +156,8 @@ def reader_for(path: Path, form: str = "") -> Reader:
         return offered[form]
     reader = max(offered.values(), key=lambda reader: reader.fits(path))
     if not reader.fits(path):
-        raise UsageError(
-            f"{path} has no ending of a known format: name it, [read] format = one of "
-            f"{', '.join(offered)}"
-        )
+        advice = f"name it, [read] format = one of {', '.join(offered)}"
+        raise UsageError(f"{path} has no ending of a known format: {advice}")
     return reader
 
 

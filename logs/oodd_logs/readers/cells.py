@@ -64,24 +64,22 @@ def numbers(cells: Sequence[str], decimal: str = ".", *, strict: bool = False) -
     if not decimal:
         column = numbers(cells, ".", strict=strict)
         return numbers(cells, ",", strict=strict) if column is None else column
-    try:
-        if decimal == ".":  # the quick way for numbers alone
+    if decimal == ".":  # the quick way for numbers alone
+        with contextlib.suppress(ValueError):
             column = np.array([*map(float, cells)], np.float64)
             return column if all(map(is_plain, cells)) else None
-    except ValueError:
-        pass
     values: dict[str, float] = {}
-    read: dict[str, float] = {}
+    plain = True
     for cell in {*cells}:
         try:
             values[cell] = number(cell, decimal)
         except ValueError:
+            plain = False
             if strict or not (known := read_texts([cell])):
                 return None
-            read |= known
-    if read and not any(np.isfinite([*values.values(), *read.values()])):
+            values |= known
+    if not plain and not any(np.isfinite([*values.values()])):
         return None
-    values |= read
     return np.fromiter(map(values.__getitem__, cells), np.float64, len(cells))
 
 
