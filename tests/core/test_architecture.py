@@ -206,8 +206,8 @@ AROUND = ("oodd_checks", "oodd_leaderboard", "oodd_live", "oodd_logs")
 LOADS = {
     "list detectors": ((*AROUND, "oodd_eval.results", "oodd_eval.scoring"), 1_950),
     "run --detector mewma --env hopper -q": (AROUND, 10_600),
-    "data inspect logs": (("oodd_eval.results", "oodd_eval.scoring", "oodd_live"), 6_000),
-    "scan logs": (("oodd_eval.results", "oodd_eval.scoring"), 10_500),
+    "data inspect logs": (("oodd_eval.results", "oodd_eval.scoring", "oodd_live"), 8_000),
+    "scan logs": (("oodd_eval.results", "oodd_eval.scoring"), 13_500),
 }
 """What a command may not load, and how many code lines of the project it loads at most."""
 
