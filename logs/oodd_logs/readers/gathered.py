@@ -165,10 +165,10 @@ class Gathered:
         shapes = {block.shape[1:] for _, block in parts} - {(0,)}
         if len(shapes) > 1:
             self._fates[plain, number_lists.KIND.words] = False
-            made = [number_lists.figures(plain, block) for _, block in parts]
+            rows = [number_lists.figures(plain, block) for _, block in parts]
             return {
-                label: self._column([(p, m[label]) for (p, _), m in zip(parts, made, strict=True)])
-                for label in made[0]
+                label: self._column([(p, m[label]) for (p, _), m in zip(parts, rows, strict=True)])
+                for label in rows[0]
             }
         columns = {}
         for first, *more in np.ndindex(*next(iter(shapes), (0,))):
