@@ -20,7 +20,8 @@ WRITTEN = {
     "run": {"output"}, "scan": {"keep", "drop", "json", "html", "rerun", "mcap"},
     "forget": {"directory"},
     "compare": {"junit", "markdown", "write_reference"}, "reproduce": {"output"}, "new": {"output"},
-    "data inspect": {"recipe"}, "data import": {"output"}, "data fetch": {"output"},
+    "data inspect": {"recipe", "json"}, "data import": {"output", "json"},
+    "data fetch": {"output"},
     "data export": {"output"}, "data build": {"output"}, "data calibrate": {"output", "work"},
     "data page": {"output"}, "policies train": {"output"}, "policies import": {"output"},
 }  # fmt: skip
