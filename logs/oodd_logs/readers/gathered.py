@@ -97,7 +97,7 @@ class Gathered:
             raise TrajectoryError(f"{name!r:.80} has more than {_DEEPEST} levels of structure")
         if kind is not dict:
             value = _unpacked(value)
-        wide = any(fnmatch.fnmatch(name, glob) for glob in self._lists)
+        wide = bool(self._lists) and any(fnmatch.fnmatch(name, glob) for glob in self._lists)
         if not wide and (known := flattened(name, value)) is not None:
             kind_of_column, pairs = known
             if kind_of_column.words:
