@@ -279,8 +279,9 @@ def scan_episodes(
 ) -> Scan:
     """Tell which of some recorded episodes are odd, and which of their rows and sensors.
 
-    Most of them have to be nominal: up to a fifth may be odd without hiding one another. With up
-    to 20 episodes each is judged by a fit on all others; more are judged in 20 groups.
+    Most of them have to be nominal: up to a fifth may be odd without hiding one another. Each is
+    judged by fits that have not seen it: by one of five, from 20 episodes on in a second pass, too,
+    which leaves out the most suspicious fifth.
 
     Parameters
     ----------
@@ -308,7 +309,7 @@ def scan_episodes(
         each sensor's mean and spread over them are brought to those of the other episodes.
     seed, horizon, parameters
         For the factory of a named detector, the class or the function. Of `panel`, which is the
-        default, ``forecast`` is ``"linear"`` unless it is given: networks would be fitted 20 times.
+        default, ``forecast`` is ``"linear"`` unless it is given: networks would be fitted ten times.
     jobs
         Fits at a time, in processes of their own where more than 1.
     fine
