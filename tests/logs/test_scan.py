@@ -21,7 +21,7 @@ from oodd_logs.scanning.outliers import (
     surprise,
 )
 
-from oodd_eval.errors import UsageError
+from oodd_eval.errors import UnknownNameError, UsageError
 from oodd_eval.metrics.binomial import clopper_pearson
 
 ROOT = Path(__file__).parents[2]
@@ -345,6 +345,134 @@ def test_tasks_are_compared_among_themselves():
     quiet[3].observations[30:] += 60
     scan = scan_episodes([*loud, *quiet], detector="mahalanobis")
     assert [one.episode.name for one in scan.odd] == ["q3"]
+
+
+# Ranks, bands and what somebody confirmed
+
+
+def noise(n, seed=0, rows=40):
+    """Episodes of white noise, by name."""
+    rng = np.random.default_rng(seed)
+    return [episode(rng.normal(size=(rows, 3)), f"run-{i:02}") for i in range(n)]
+
+
+def quick(episodes, **arguments):
+    return scan_episodes(episodes, sensors=SENSORS, detector="mahalanobis", **arguments)
+
+
+def test_confirmed_episodes_are_the_calibration_and_never_called():
+    """Ranks among 20 of them are exact for two others, and not small enough for three."""
+    episodes = noise(23)
+    for i in (3, 20):  # also a confirmed one
+        episodes[i].observations[20:, 1] += 50
+    two, three = (quick(episodes[:n], fine=["run-0*", "run-1?"]) for n in (22, 23))
+    alone = quick(episodes[:22])
+    assert {one.episode.name for one in alone.odd} == {"run-03", "run-20"}
+    for scan in (two, three):
+        assert {one.band for one in scan.episodes[:20]} == {"fine"}
+        assert {one.position for one in scan.episodes[20:]} == {*range(1, len(scan.episodes) - 19)}
+        assert np.isnan([one.q for one in scan.episodes[:20]]).all()
+    odd, other = two.episodes[20:]
+    assert "confirmed episodes are enough for p-values by rank" in " ".join(two.notes)
+    # One confirmed episode is as odd.
+    assert odd.p == odd.rank_p
+    assert odd.p in {1 / 21, 2 / 21}
+    assert other.p == other.rank_p == pytest.approx(round(other.p * 21) / 21)
+    assert other.p > odd.p
+    assert "enough for p-values by rank" not in " ".join(three.notes)
+    assert three.episodes[20].p != three.episodes[20].rank_p
+
+
+def test_ranks_among_confirmed_episodes_by_hand():
+    """The loudest of 22 is above all 20 that are confirmed, the third above all but one."""
+    (base,) = noise(1)
+    loudness = np.random.default_rng(0).permutation(np.geomspace(1, 1e4, 22))
+    order = np.argsort(-loudness)
+    episodes = [episode(base.observations * x, f"run-{i:02}") for i, x in enumerate(loudness)]
+    tested = int(order[0]), int(order[2])
+    scan = quick(episodes, fine=[f"run-{i:02}" for i in range(22) if i not in tested])
+    assert [scan.episodes[i].p for i in tested] == pytest.approx([1 / 21, 2 / 21])
+    assert [scan.episodes[i].band for i in tested] == ["surely", "surely"]
+    assert [one.episode.name for one in scan.ranked[:2]] == [f"run-{i:02}" for i in tested]
+
+
+def test_confirmed_episodes_are_named_or_matched():
+    episodes = noise(12)
+    episodes[5].observations[20:, 1] += 50
+    assert [one.episode.name for one in quick(episodes).odd] == ["run-05"]
+    for fine in (["run-05"], ["run-0[3-6]"], ["run-11", "*5"]):
+        scan = quick(episodes, fine=fine)
+        assert scan.episodes[5].band == "fine"
+        assert not scan.odd
+    assert quick(episodes, fine=["run-04"]).episodes[5].odd
+    windows = quick(episodes, window=20, fine=["run-05"])
+    assert {one.band for one in windows.episodes if "run-05" in one.episode.name} == {"fine"}
+    for wrong in ("run-5", "x*"):
+        with pytest.raises(UnknownNameError, match=re.escape(wrong)):
+            quick(episodes, fine=["run-01", wrong])
+
+
+@pytest.mark.parametrize(("count", "mixed"), [(4, False), (5, True)])
+def test_more_than_a_fifth_are_several_kinds(count, mixed):
+    episodes = noise(24)
+    for i in range(count):
+        episodes[5 * i].observations[20:, i % 3] += 50
+    scan = quick(episodes, first=2)
+    standing_out = {f"run-{5 * i:02}" for i in range(count)}
+    assert scan.kinds_mixed == mixed
+    assert {one.episode.name for one in scan.ranked[:count]} == standing_out
+    assert {one.band for one in scan.ranked[:count]} == {"look at" if mixed else "surely"}
+    assert {one.band for one in scan.ranked[count:]} == {"fine"}
+    assert (f"{count} episodes stand out" in " ".join(scan.notes)) == mixed
+    assert scan.as_json()["odd"] == ([] if mixed else sorted(standing_out))
+
+
+def test_a_skipped_step_is_missing_from_the_figures():
+    """No row is unusual where a peak is left out."""
+    rng, rows = np.random.default_rng(0), np.arange(80)
+    episodes = []
+    for i in range(30):
+        x = 0.05 * rng.normal(size=(80, 3))
+        x += np.sin(rows / 16)[:, None]
+        if i != 17:
+            x[:, 1] += 2 * np.exp(-(((rows - 45 - rng.normal()) / 5) ** 2))
+        episodes.append(episode(x, f"run-{i:02}"))
+    scan = quick(episodes, first=3)
+    oddest = scan.ranked[0]
+    assert (oddest.episode.name, oddest.band) == ("run-17", "surely")
+    assert oddest.reason.startswith("largest of torque is ")
+    assert (oddest.suspects, oddest.first) == (["torque"], None)
+    assert [one.position for one in scan.ranked] == [*range(1, 31)]
+    assert [one.band for one in scan.ranked[1:]] == ["look at"] * 2 + ["fine"] * 27
+
+
+@pytest.mark.parametrize(
+    ("rows", "value", "faults", "odd"),
+    [
+        (slice(-3, None), "missing", [], False),  # the logger's end
+        (slice(20, 32), "missing", ["missing"], True),
+        (slice(20, 50), "largest", ["saturated"], False),  # a beam that meets nothing
+        (slice(20, 50), "usual", ["frozen"], True),
+    ],
+)
+def test_an_end_of_a_log_or_of_a_range_makes_nothing_odd(rows, value, faults, odd):
+    episodes = [episode(x, f"e{i}") for i, x in enumerate(logs(n=24, rows=100))]
+    column = episodes[7].observations[:, 1]
+    column[rows] = {"missing": np.nan, "largest": column.max(), "usual": column[20]}[value]
+    scan = quick(episodes)
+    assert [one.episode.name for one in scan.odd] == ["e7"] * odd
+    assert [f.fault for f in scan.episodes[7].faults if f.what == "torque"] == faults
+
+
+@pytest.mark.parametrize("n", [2, LEAST - 1, LEAST])
+def test_nothing_is_surely_odd_without_a_p_value(n):
+    episodes = noise(n)
+    episodes[1].observations[10:, 1] += 1e5
+    scan = quick(episodes, first=1)
+    oddest = scan.ranked[0]
+    assert np.isnan([one.p for one in scan.episodes]).all() == (n < LEAST)
+    assert oddest.band == ("surely" if n >= LEAST else "look at")
+    assert n < LEAST - 1 or oddest.episode.name == "run-01"
 
 
 # Faults of the stream
