@@ -97,7 +97,12 @@ def clean(episodes: Sequence[Episode]) -> list[CleanedEpisode]:
         held = _held(rows, spread), _held(episode.actions, commanded)
         good = _is_good(rows, spread)
         broken = ~good & ~np.isnan(rows)
-        read = np.where(good | _is_end(rows), held[0], np.nan).astype(np.float32)
+        # Where the logger ended, readings before run back: neither missing nor frozen ones.
+        ended = _is_end(rows)
+        last = len(rows) - 1 - ended.sum(axis=0)
+        back = np.clip(2 * last - np.arange(len(rows))[:, None], 0, len(rows) - 1)
+        mirrored = np.take_along_axis(held[0], back, axis=0)
+        read = np.where(good, held[0], np.where(ended, mirrored, np.nan)).astype(np.float32)
         recorded = episode.observations
         cleaned.append(
             CleanedEpisode(
