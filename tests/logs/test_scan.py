@@ -373,7 +373,7 @@ def test_confirmed_episodes_are_the_calibration_and_never_called():
         assert {one.position for one in scan.episodes[20:]} == {*range(1, len(scan.episodes) - 19)}
         assert np.isnan([one.q for one in scan.episodes[:20]]).all()
     odd, other = two.episodes[20:]
-    assert "confirmed episodes are enough for p-values by rank" in " ".join(two.notes)
+    assert "20 confirmed episodes are enough" in " ".join(two.notes)
     # One confirmed episode is as odd.
     assert odd.p == odd.rank_p
     assert odd.p in {1 / 21, 2 / 21}

@@ -623,11 +623,13 @@ def _by_others(
 ) -> _Comparison:
     """Compare episodes with the others, or with those that are confirmed if these are enough."""
     episodes, count = [one.episode for one in evidence], len(evidence)
-    reference, exact = peers, False
+    reference = peers
     if is_apart := len({episodes[i].recording for i in fine}) >= LEAST:
         reference = [Peers.of(episodes, i, fine) for i in range(count)]
-        units = min(others.units for others in reference)
-        exact = (units + 1) * fdr >= count - len(fine)
+    # A confirmed episode, which is not tested, has one fewer to be compared with.
+    tested = sorted({*range(count)} - {*fine}) or fine
+    units = min(reference[i].units for i in tested)
+    exact = is_apart and (units + 1) * fdr >= len(tested)
     largest = np.array([one.largest for one in evidence])
     stream = np.array([one.stream.max() for one in evidence])
     distances = np.array([one.figure.distance if one.figure else 0.0 for one in evidence])
@@ -648,7 +650,6 @@ def _by_others(
     above = [
         is_apart and bool(x > rank[y.numbers].max()) for x, y in zip(rank, reference, strict=True)
     ]
-    units = min(others.units for others in reference)
     return _Comparison(
         surprises, excesses, tails, np.array(ranks), units, is_apart, exact, threshold, above
     )
