@@ -309,7 +309,8 @@ def scan_episodes(
         each sensor's mean and spread over them are brought to those of the other episodes.
     seed, horizon, parameters
         For the factory of a named detector, the class or the function. Of `panel`, which is the
-        default, ``forecast`` is ``"linear"`` unless it is given: networks would be fitted ten times.
+        default, ``forecast`` is ``"linear"`` unless it is given: networks would be fitted ten
+        times.
     jobs
         Fits at a time, in processes of their own where more than 1.
     fine
