@@ -59,7 +59,7 @@ class PairedDifference:
 
     @property
     def told_apart(self) -> bool:
-        """Whether the rows are told apart: the interval leaves out 0, and so p is at most 0.05."""
+        """True if the interval excludes 0, so that p is at most 0.05."""
         return self.low > 0 or self.high < 0
 
 

@@ -82,9 +82,9 @@ def with_fault(
         spoilt[after, faulty] = rows[ONSET, faulty]
     else:
         times = ONSET + (1 - size) * np.arange(n - ONSET)
-        whole = times.astype(int)
-        weights = (times - whole)[:, None]
-        spoilt[after] = (1 - weights) * rows[whole] + weights * rows[np.minimum(whole + 1, n - 1)]
+        before = times.astype(int)
+        weights = (times - before)[:, None]
+        spoilt[after] = (1 - weights) * rows[before] + weights * rows[np.minimum(before + 1, n - 1)]
     return spoilt
 
 

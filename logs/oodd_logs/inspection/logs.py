@@ -275,8 +275,8 @@ class Inspection:
     @cached_property
     def kinds(self) -> Recognised:
         """Kinds of the columns of numbers that are no times or labels."""
-        others = {*self.times, *self.added.values(), *self.labels}
-        plain = {n: c for n, c in self.columns.items() if not (n in others or c.empty or c.text)}
+        excluded = {*self.times, *self.added.values(), *self.labels}
+        plain = {n: c for n, c in self.columns.items() if not (n in excluded or c.empty or c.text)}
         return recognise(plain)
 
     @cached_property
