@@ -99,7 +99,8 @@ class ScannedEpisode:
     sensors
         Share of each sensor in the evidence at that row, by name, the largest first.
     faults
-        Of the stream: those that would make an episode odd, and gaps, which do not.
+        Of the stream: those that are as rare as what makes an episode odd. Gaps and saturated
+        sensors are listed, too, and make none odd.
     band
         Whether it is odd (``"surely"``), or to be looked at.
     position
