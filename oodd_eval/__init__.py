@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from oodd_eval.data.trajectory import Trajectory
     from oodd_eval.plugins import hookimpl
     from oodd_eval.plugins.contract import Detector, DetectorSpec
-    from oodd_eval.plugins.explanations import Explanation
+    from oodd_eval.plugins.explanations import Explanation, Naming
 
 __all__ = [
     "AnomalySpec",
@@ -27,6 +27,7 @@ __all__ = [
     "EnvironmentSpec",
     "Explanation",
     "Fault",
+    "Naming",
     "Quantity",
     "Trajectory",
     "__version__",
@@ -34,6 +35,7 @@ __all__ = [
     "evaluate",
     "hookimpl",
     "import_frames",
+    "intervene",
     "live",
     "load_results",
     "load_split",
@@ -47,11 +49,15 @@ _NAMES = {
     "data.trajectory": ("Trajectory",),
     "plugins": ("hookimpl",),
     "plugins.contract": ("Detector", "DetectorSpec"),
-    "plugins.explanations": ("Explanation",),
+    "plugins.explanations": ("Explanation", "Naming"),
 }
 _HOMES = {name: f"{__name__}.{home}" for home, names in _NAMES.items() for name in names}
 # Known by name alone: nothing here imports these packages.
-_HOMES |= {"check_detector": "oodd_checks", "import_frames": "oodd_logs"}
+_HOMES |= {
+    "check_detector": "oodd_checks",
+    "import_frames": "oodd_logs",
+    "intervene": "oodd_interventions",
+}
 _MODULES = {"live": "oodd_live"}
 
 

@@ -22,6 +22,7 @@ OFFER_HOOKS: Final = (
     "oodd_detectors",
     "oodd_environments",
     "oodd_anomalies",
+    "oodd_acts",
     "oodd_kinds",
     "oodd_readers",
     "oodd_detector_from_spec",
@@ -92,6 +93,19 @@ def oodd_readers() -> list[Any] | None:
     Returns
     -------
     list of oodd_logs.Reader
+        None stands for an empty list.
+    """
+
+
+@hookspec
+def oodd_acts() -> list[Any] | None:
+    """Offer acts, which ``oodd-eval intervene`` lets an alarm bring about.
+
+    Called once, when interventions are studied. It has to be quick, as `oodd_environments` is.
+
+    Returns
+    -------
+    list of oodd_interventions.ActSpec
         None stands for an empty list.
     """
 

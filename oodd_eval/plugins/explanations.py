@@ -19,6 +19,34 @@ FLIPPED: Final = 0.05
 _ROUNDING: Final = 1e-5  # of a sum of shares
 
 
+FAULT_KINDS: Final = ("sensor", "actuator", "body", "environment")
+"""What a naming may say of where a fault is; an empty text where it says nothing."""
+
+
+class Naming(NamedTuple):
+    """The parts that are at fault, as seen at the last row of an episode.
+
+    A part with a probability of one half or more is named.
+
+    Attributes
+    ----------
+    sensors : float64 array of shape (D,)
+        Probability of each sensor being faulty, from 0 to 1.
+    actuators : float64 array of shape (A,)
+        The same of each actuator; of shape (0,) from a detector that does not see actions.
+    sizes : float64 array of shape (D,)
+        Size of each sensor's fault in the sensor's unit, a standard deviation about what it should
+        read. NaN where it is not known, and infinite where the sensor's reading says nothing.
+    kind
+        One of `FAULT_KINDS`, or empty.
+    """
+
+    sensors: NDArray[np.float64]
+    actuators: NDArray[np.float64]
+    sizes: NDArray[np.float64]
+    kind: str = ""
+
+
 class Explanation(NamedTuple):
     """Shares of the sensors in each score of one episode with T transitions, and onsets.
 
@@ -30,10 +58,13 @@ class Explanation(NamedTuple):
     onsets : int64 array of shape (T + 1,)
         The row, at most t, with which an anomaly would have begun as seen at row t; -1 where the
         score is undefined.
+    naming
+        The parts at fault as seen at the last row, from a detector that names them as a set.
     """
 
     shares: NDArray[np.float64]
     onsets: NDArray[np.int64]
+    naming: Naming | None = None
 
 
 @runtime_checkable
