@@ -74,7 +74,7 @@ class Good:
         return Trajectory(self.seen, np.array(self.done) if self.done else np.empty((0, 1)))
 
     def explain_last(self):
-        shares, onsets = self.explain(self.lived())
+        shares, onsets, _ = self.explain(self.lived())
         return shares[-1], int(onsets[-1])
 
     def state(self):
@@ -251,7 +251,7 @@ for check, name, message, change in (
     alters("score", change, check, name, message)
 
 for name, message, change in (
-    ("Nothing", "explain returned NoneType, expected shares and onsets", lambda *_: None),
+    ("Nothing", "explain returned NoneType, expected shares, onsets", lambda *_: None),
     ("OnsetsInBetween", "onsets as float64 of shape (81,)", lambda _, e, x: (e[0], e[1] - 0.5)),
     ("SharesInPercent", "explain gives the shares", lambda _, e, x: (100 * e[0], e[1])),
     (
@@ -372,7 +372,7 @@ class KnowsTheLength(Good):
 @breaks("explain", "the first 2 of 81 observations alone have other shares:")
 class SharesOfTheWhole(Good):
     def explain(self, x):
-        shares, onsets = super().explain(x)
+        shares, onsets, _ = super().explain(x)
         mean = np.nanmean(shares, axis=0) if len(x) > self.horizon else 1 / shares.shape[1]
         return np.where(np.isnan(shares), np.nan, mean), onsets
 

@@ -168,6 +168,6 @@ class _Prefixes:
         self._sofar = Trajectory(self._observations, self._actions or None)
         return float(float_scores(self._detector.score(self._sofar))[-1])
 
-    def _explain_last(self) -> tuple[NDArray[np.float64], int]:
-        shares, onsets = self._detector.explain(self._sofar)
-        return shares[-1], int(onsets[-1])
+    def _explain_last(self) -> tuple[Any, ...]:
+        shares, onsets, *naming = self._detector.explain(self._sofar)
+        return shares[-1], int(onsets[-1]), *naming

@@ -493,7 +493,7 @@ class Watchdog:
             return {self._name(d): 1 / len(faulty) for d in faulty}, onset
         if OBSERVATION in self._faults or self._explain_last is None:
             return {}, None
-        shares, onset = self._explain_last()
+        shares, onset, *_ = self._explain_last()
         if onset < 0:
             return {}, None
         order = np.argsort(-shares, kind="stable").tolist()

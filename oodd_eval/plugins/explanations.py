@@ -74,7 +74,9 @@ class ExplainingDetector(Detector, Protocol):
     def explain(self, trajectory: Trajectory) -> Explanation:
         """Return what the scores of an episode are due to; as causal as `score`.
 
-        The one sensor with the largest share at a row is named for it.
+        The one sensor with the largest share at a row is named first for it. The parts that are at
+        fault at the last row are those of the naming, else those of `naming_of`. A tuple of two or
+        three values will do.
 
         Parameters
         ----------
@@ -91,7 +93,9 @@ class ExplainingDetector(Detector, Protocol):
 class StreamingExplainer(StreamingDetector, Protocol):
     """A detector that tells beside a robot, too, which sensors its scores are from."""
 
-    def explain_last(self) -> tuple[NDArray[np.float64], int]:
+    def explain_last(
+        self,
+    ) -> tuple[NDArray[np.float64], int] | tuple[NDArray[np.float64], int, Naming]:
         """Return what the score of the latest `update` is due to: that row of ``explain``.
 
         Returns
@@ -100,6 +104,8 @@ class StreamingExplainer(StreamingDetector, Protocol):
             Share of each sensor, with the sum 1; NaN where the score is undefined.
         onset : int
             The row since the latest ``reset`` with which an anomaly would have begun, or -1.
+        naming : Naming, optional
+            The parts at fault as seen at this row, where ``explain`` names them as a set.
         """
 
 
@@ -112,25 +118,20 @@ def explain_chunk(detector: Any, chunk: Sequence[Trajectory]) -> list[object]:
     """Return explanations of the last rows of episodes, after all rows were checked."""
     checked = (checked_explanation(detector.explain(episode), episode) for episode in chunk)
     # Of several with the largest share the first one is named.
-    return [np.array([np.nan_to_num(s[-1]).argmax(), o[-1]], dtype=np.int32) for s, o in checked]
+    return [np.array([np.nan_to_num(s[-1]).argmax(), o[-1]], dtype=np.int32) for s, o, _ in checked]
 
 
 def checked_explanation(returned: Any, trajectory: Trajectory) -> Explanation:
     """Return what ``explain`` returned for a trajectory; `ContractError` against the contract."""
     rows, sensors = trajectory.observations.shape
     try:
-        shares, onsets = returned
+        shares, onsets, naming = returned if len(returned) > 2 else (*returned, None)
     except (TypeError, ValueError):
         kind = type(returned).__name__
-        raise ContractError(f"explain returned {kind}, expected shares and onsets") from None
-    for name, array, form in (
-        ("shares", shares, f"float64 of shape {(rows, sensors)}"),
-        ("onsets", onsets, f"int64 of shape {(rows,)}"),
-    ):
-        is_array = isinstance(array, np.ndarray) and not np.ma.is_masked(array)
-        actual = f"{array.dtype} of shape {array.shape}" if is_array else type(array).__name__
-        if actual != form:
-            raise ContractError(f"explain returned {name} as {actual}, expected {form}")
+        expected = "shares, onsets and perhaps a Naming"
+        raise ContractError(f"explain returned {kind}, expected {expected}") from None
+    _check_form("shares", shares, f"float64 of shape {(rows, sensors)}")
+    _check_form("onsets", onsets, f"int64 of shape {(rows,)}")
     undefined = np.isnan(shares).all(axis=1)
     parts = (shares >= 0).all(axis=1) & (np.abs(shares.sum(axis=1) - 1) <= _ROUNDING)
     valid = (onsets >= 0) & (onsets <= np.arange(rows))
@@ -146,7 +147,89 @@ def checked_explanation(returned: Any, trajectory: Trajectory) -> Explanation:
         if not fine.all():
             t = int(fine.argmin())
             raise ContractError(f"explain gives the {name} {array[t]} at t = {t}: {expected}")
-    return Explanation(shares, onsets)
+    if naming is not None:
+        naming = checked_naming(naming, sensors, trajectory.action_dim)
+    return Explanation(shares, onsets, naming)
+
+
+def checked_naming(returned: Any, sensors: int, actions: int) -> Naming:
+    """Return a naming that came back from ``explain`` or ``explain_last``, checked.
+
+    Parameters
+    ----------
+    returned
+        A `Naming`, or a tuple of its four values.
+    sensors, actions
+        Numbers of the sensors and of the actions that the detector sees.
+
+    Returns
+    -------
+    Naming
+
+    Raises
+    ------
+    ContractError
+        For another type, shape or kind, a probability outside of 0 to 1, or a negative size.
+    """
+    try:
+        naming = Naming(*returned)
+    except TypeError:
+        kind = type(returned).__name__
+        raise ContractError(f"explain names parts as {kind}, expected a Naming") from None
+    seen = actions if np.size(naming.actuators) else 0
+    for name, n in (("sensors", sensors), ("actuators", seen), ("sizes", sensors)):
+        _check_form(name, values := getattr(naming, name), f"float64 of shape {(n,)}")
+        most, range_ = (np.inf, "0 or more, or NaN") if name == "sizes" else (1.0, "0 to 1")
+        bad = (values < 0) | (values > most) | (np.isnan(values) & (name != "sizes"))
+        if bad.any():
+            d = int(bad.argmax())
+            raise ContractError(f"explain names {name} with {values[d]} at {d}, expected {range_}")
+    if naming.kind not in ("", *FAULT_KINDS):
+        expected = ", ".join(map(repr, ("", *FAULT_KINDS)))
+        raise ContractError(f"explain names the kind {naming.kind!r}, expected one of {expected}")
+    return naming
+
+
+def naming_of(explanation: Explanation, actions: int) -> Naming:
+    """Return the parts that an explanation names at its last row.
+
+    One that has shares alone names the fewest sensors that together carry half of the last row's
+    shares, and none where these are undefined.
+
+    Parameters
+    ----------
+    explanation
+        Of an episode until now.
+    actions
+        Number of actuators in the naming; those of a detector that sees none are not at fault.
+
+    Returns
+    -------
+    Naming
+
+    Examples
+    --------
+    >>> shares = np.array([[0.1, 0.4, 0.2, 0.3]])
+    >>> naming_of(Explanation(shares, np.array([0])), actions=1).sensors
+    array([0., 1., 0., 1.])
+    """
+    none = np.zeros(actions)
+    if naming := explanation.naming:
+        return naming if len(naming.actuators) else naming._replace(actuators=none)
+    shares = np.nan_to_num(explanation.shares[-1])
+    order = np.argsort(-shares, kind="stable")
+    before = np.cumsum(shares[order]) - shares[order]
+    sensors = np.zeros(len(shares))
+    sensors[order[(before < 0.5 - _ROUNDING) & (shares[order] > 0)]] = 1.0
+    return Naming(sensors, none, np.full(len(shares), np.nan))
+
+
+def _check_form(name: str, array: Any, form: str) -> None:
+    """Raise `ContractError` for another type or shape than ``"float64 of shape (3,)"``."""
+    is_array = isinstance(array, np.ndarray) and not np.ma.is_masked(array)
+    actual = f"{array.dtype} of shape {array.shape}" if is_array else type(array).__name__
+    if actual != form:
+        raise ContractError(f"explain returned {name} as {actual}, expected {form}")
 
 
 def check_named(array: object, rows: int, sensors: int, where: str) -> Named:

@@ -61,7 +61,7 @@ class Fails(Tells):
 
 class Overstates(Tells):
     def explain(self, x):
-        shares, onsets = super().explain(x)
+        shares, onsets, _ = super().explain(x)
         return 2 * shares, onsets
 
 

@@ -367,7 +367,7 @@ def test_explain(trial: Trial) -> None:
         for row in zip(trajectory.observations, [None, *trajectory.actions], strict=True):
             detector.update(*row)
             rows.append(detector.explain_last())
-        shares, onsets = np.stack([s for s, _ in rows]), np.array([int(o) for _, o in rows])
+        shares, onsets = np.stack([row[0] for row in rows]), np.array([int(row[1]) for row in rows])
     different = _difference(Explanation(shares, onsets), expected)
     assert not different, (
         f"explain_last gives other {different[0]} than explain, first at t = {different[1]}: "

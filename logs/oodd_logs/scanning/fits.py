@@ -62,7 +62,7 @@ class Fit:
                 scores, explanation = handle.scores(x, base), None
                 if is_explained and isinstance(detector, ExplainingDetector):
                     visible = handle.visible(x, base)
-                    shares, onsets = checked_explanation(detector.explain(visible), visible)
+                    shares, onsets, _ = checked_explanation(detector.explain(visible), visible)
                     shares = np.pad(shares, ((hidden, 0), (0, 0)), constant_values=np.nan)
                     onsets = np.where(onsets < 0, -1, onsets + hidden)
                     onsets = np.pad(onsets, (hidden, 0), constant_values=-1)
