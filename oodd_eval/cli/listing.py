@@ -10,7 +10,14 @@ from tabulate import tabulate
 from oodd_eval.cli import Options, command, say_notes
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS
 from oodd_eval.data.registry import AnomalySpec, EnvironmentSpec
-from oodd_eval.metrics.catalogue import ATTRIBUTION, GUARANTEED, LEVELS, METRICS, metric_info
+from oodd_eval.metrics.catalogue import (
+    ATTRIBUTION,
+    GUARANTEED,
+    INTERVENTIONS,
+    LEVELS,
+    METRICS,
+    metric_info,
+)
 from oodd_eval.names import check_known, counted
 from oodd_eval.plugins.contract import training_mark
 from oodd_eval.plugins.discovery import Plugins, discover
@@ -117,3 +124,4 @@ def _metrics() -> Rows:
         yield f"..._{suffix}", f"{', '.join(GUARANTEED)}: {at}"
         yield f"threshold_{suffix}", "the threshold of their statistic"
     yield from ((name, metric_info(name).summary) for name in ATTRIBUTION)
+    yield from ((name, f"intervene: {info.summary}") for name, info in INTERVENTIONS.items())

@@ -155,6 +155,9 @@ _EXPLAINED: Final = _facts("attribution")
 ATTRIBUTION: Final = tuple(f"{name}_{HEADLINE}" for name in _EXPLAINED)
 """Metrics of detectors that explain, at the headline level alone."""
 
+INTERVENTIONS: Final = MappingProxyType(_facts("intervention"))
+"""Columns of studies of interventions: no record of a cell that is scored has them."""
+
 NAMES: Final = (
     *METRICS,
     *(f"{name}_{suffix}" for suffix in LEVELS for name in _BY_LEVEL),

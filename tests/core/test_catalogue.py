@@ -11,6 +11,7 @@ from oodd_eval.metrics.catalogue import (
     ATTRIBUTION,
     GUARANTEED,
     HEADLINE,
+    INTERVENTIONS,
     LEVELS,
     METRICS,
     NAMES,
@@ -111,3 +112,14 @@ def test_the_documented_metrics_are_those_of_the_catalogue():
     levels = {name.partition("_at_")[0] for name in NAMES if metric_info(name).level}
     assert len(documented) > 12
     assert set(documented) <= {*METRICS, *levels}
+
+
+def test_columns_of_interventions_are_no_metrics_of_records():
+    """They have the same facts, and stand in records of their own."""
+    assert not {*INTERVENTIONS} & {*NAMES}
+    for name, info in INTERVENTIONS.items():
+        assert info.name == name
+        assert info.null in ("", *INTERVENTIONS)
+    better = {name: info.better for name, info in INTERVENTIONS.items()}
+    assert [n for n, side in better.items() if side == "higher"] == ["return_saved", "safety_gain"]
+    assert [n for n, side in better.items() if not side] == ["placebo_saved", "forced_harm", "acted"]
