@@ -61,8 +61,7 @@ class Setup:
         """Record the nominal episode of a seed; `SimulationError` for a negative one."""
         if seed < 0:
             raise SimulationError(f"seed is {seed}, expected a whole number from 0")
-        rows, actions, rewards, over, _ = _run(self, seed)
-        return RecordedEpisode(Trajectory(rows, actions), rewards, over, seed)
+        return _run(self, seed)
 
 
 class TwinTooShortError(SimulationError):
@@ -75,7 +74,8 @@ class RecordedEpisode:
 
     `onset` is the index of the first observation that may differ from the twin's, `effect` of the
     first that does, both None when nominal; `parameters` are what the anomaly drew, `redraws`
-    counts rejected draws.
+    counts rejected draws, and `attempt` is the one that was taken: an episode can be run again.
+    `measured` has the rows before the anomaly corrupted sensors.
     """
 
     trajectory: Trajectory
@@ -86,6 +86,8 @@ class RecordedEpisode:
     effect: int | None = None
     parameters: dict[str, Any] = field(default_factory=dict)
     redraws: int = 0
+    attempt: int = 0
+    measured: _Rows | None = None
 
 
 def record_seed(
@@ -209,10 +211,7 @@ def record_anomalous(
 
     After so many `redraws` the longest episode is taken.
     """
-    environment = setup.environment
-    maker: FaultMaker = functools.partial(draw, environment, kind)
-    if strength is not None:
-        maker = functools.partial(make_fault, kind, strength)
+    environment, maker = setup.environment, _maker(setup.environment, kind, strength)
     longest: RecordedEpisode | None = None
     tail = -1
     for attempt in range(redraws + 1):
@@ -225,8 +224,15 @@ def record_anomalous(
             return longest
     if longest is None and strength is not None:
         # Too weak to be felt: the episode stays, and counts from its onset on.
-        drawn = (episode.onset, episode.onset, episode.parameters, redraws)
-        return RecordedEpisode(twin.trajectory, twin.rewards, twin.terminated, twin.seed, *drawn)
+        return replace(
+            twin,
+            onset=episode.onset,
+            effect=episode.onset,
+            parameters=episode.parameters,
+            redraws=redraws,
+            attempt=redraws,
+            measured=episode.measured,
+        )
     if longest is None:
         raise SimulationError(
             f"no {kind} episode of {environment} with seed {twin.seed} differs from its twin "
@@ -235,24 +241,51 @@ def record_anomalous(
     return replace(longest, redraws=redraws)
 
 
+def record_again(
+    setup: Setup,
+    kind: str,
+    strength: float | None,
+    twin: RecordedEpisode,
+    attempt: int,
+    policy: Policy,
+) -> RecordedEpisode:
+    """Record an attempt of `record_anomalous` again, with another policy from the first row on.
+
+    Up to the first command that differs, rows and commands are the same, bit for bit.
+    """
+    maker = _maker(setup.environment, kind, strength)
+    return record_attempt(setup, kind, twin, maker, attempt, policy)
+
+
+def _maker(environment: str, kind: str, strength: float | None) -> FaultMaker:
+    """Return what draws a fault: of Table 1 without a strength."""
+    if strength is None:
+        return functools.partial(draw, environment, kind)
+    return functools.partial(make_fault, kind, strength)
+
+
 def record_attempt(
-    setup: Setup, kind: str, twin: RecordedEpisode, maker: FaultMaker, attempt: int = 0
+    setup: Setup,
+    kind: str,
+    twin: RecordedEpisode,
+    maker: FaultMaker,
+    attempt: int = 0,
+    policy: Policy | None = None,
 ) -> RecordedEpisode:
     """Record the episode of a twin's seed under what `maker` makes, whatever comes of it.
 
-    The attempt decides the onset and the generator that `maker` is given.
+    The attempt decides the onset and the generator that `maker` is given. A `policy` acts in place
+    of the setup's.
     """
     commands = list(twin.trajectory.actions)
     if info_of(setup.environment).discrete:
         commands = [int(row.argmax()) for row in commands]
     rng = generator(setup.environment, kind, twin.seed, attempt)
     onset = int(rng.integers(FIRST_ONSET, int(LAST_ONSET_SHARE * len(commands)) + 1))
-    rows, actions, rewards, over, parameters = _run(
-        setup, twin.seed, commands[: onset - 1], (maker, rng)
-    )
-    effect = first_difference(rows, twin.trajectory.observations)
-    drawn = (onset, effect, parameters, attempt)
-    return RecordedEpisode(Trajectory(rows, actions), rewards, over, twin.seed, *drawn)
+    acting = replace(setup, policy=policy or setup.policy)
+    episode = _run(acting, twin.seed, [] if policy else commands[: onset - 1], (maker, rng, onset))
+    effect = first_difference(episode.trajectory.observations, twin.trajectory.observations)
+    return replace(episode, onset=onset, effect=effect, redraws=attempt, attempt=attempt)
 
 
 def first_difference(rows: _Rows, twin: _Rows) -> int | None:
@@ -266,9 +299,9 @@ def _run(
     setup: Setup,
     seed: int,
     replayed: Sequence[Any] = (),
-    anomaly: tuple[FaultMaker, np.random.Generator] | None = None,
-) -> tuple[_Rows, _Rows, _Rows, bool, dict[str, Any]]:
-    """Run an episode: replayed actions first, then the policy, under an anomaly if there is one."""
+    anomaly: tuple[FaultMaker, np.random.Generator, int] | None = None,
+) -> RecordedEpisode:
+    """Run an episode: replayed actions first, then the policy, under an anomaly from its onset."""
     environment, policy, fault = setup.environment, setup.policy, None
     simulator, info, noisy = make(environment), info_of(environment), _noise(setup, seed)
     cap = min(info.episode_cap, setup.episode_cap or info.episode_cap)
@@ -284,6 +317,7 @@ def _run(
                 "mend the environment's spec"
             )
         rows[0] = noisy(rows[0])
+        measured = [rows[0]]
         memory = isinstance(policy, CustomPolicy) and policy.has_memory
         if isinstance(policy, CustomPolicy):
             policy.reset()
@@ -298,21 +332,28 @@ def _run(
                     "reset() forget all that act() remembers, and draw nothing at random"
                 )
             actions.append(action)
-            if anomaly is not None and step == len(replayed):
+            if anomaly is not None and step == anomaly[2] - 1:
                 fault = anomaly[0](simulator, anomaly[1])
                 fault.begin(simulator, rows)
             # A copy: what the policy commanded is stored, whatever becomes of it.
             command = action if fault is None else fault.command(copy.copy(action), simulator)
             row, reward, over = simulator.step(command)
             row = noisy(row)
+            measured.append(row)
             rows.append(row if fault is None else fault.observe(row, len(rows)))
             rewards.append(reward)
     finally:
         simulator.close()
     one_hot = np.eye(info.action_dim, dtype=np.float32)
     commands = one_hot[actions] if info.discrete else np.array(actions, np.float32)
-    parameters = fault.parameters if fault is not None else {}
-    return np.array(rows, np.float32), commands, np.array(rewards, np.float32), over, parameters
+    return RecordedEpisode(
+        Trajectory(np.array(rows, np.float32), commands),
+        np.array(rewards, np.float32),
+        over,
+        seed,
+        parameters=fault.parameters if fault is not None else {},
+        measured=np.array(measured, np.float32) if fault is not None else None,
+    )
 
 
 def _noise(setup: Setup, seed: int) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
