@@ -17,14 +17,15 @@ from oodd_eval.data.facts import Group
 
 @dataclass(slots=True)
 class Situation:
-    """An episode at the row of an alarm.
+    """An episode from the row of an alarm on. Rows, actions and naming are kept current.
 
     Attributes
     ----------
     environment, policy
         Name, and the policy that has acted until now, with the memory that it has.
     rows : float32 array of shape (t + 1, D)
-        Observations as the sensors reported them; the last one is the alarm's row.
+        Observations as the sensors reported them; the last one is the latest, at first the
+        alarm's row.
     actions : float32 array of shape (t, A)
         Commands between them, as trajectories have them: one-hot where they are discrete.
     naming

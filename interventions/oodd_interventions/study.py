@@ -1,0 +1,431 @@
+"""A study of interventions: every detector, environment, condition and act, with shared arms.
+
+Fits and cells are files of the output directory, whole or absent, so that an interrupted study goes
+on where it was. Detectors that fail are reported with the reason, and the others go on.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import json
+import time
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
+from dataclasses import astuple, dataclass
+from pathlib import Path
+from typing import Any, Final, cast
+
+from oodd_common.naming import ReadingModel
+from oodd_live.handle import DetectorHandle
+from oodd_recording.build import MOST_CANDIDATES, Progress, workers
+from oodd_recording.closed_loop import (
+    SHORTEST_TWIN,
+    RecordedEpisode,
+    Setup,
+    measure,
+    record_anomalous,
+)
+from oodd_recording.policies import load_policy
+from oodd_recording.registered import info_of
+
+from oodd_eval.data import layout
+from oodd_eval.data.condition import Condition
+from oodd_eval.data.facts import Group, SplitDefinition
+from oodd_eval.data.files import only_writer, write_text
+from oodd_eval.data.parts import EnvironmentData
+from oodd_eval.data.registry import register
+from oodd_eval.data.split import Split, load_split
+from oodd_eval.errors import SimulationError, UsageError
+from oodd_eval.metrics.alarms import Calibration, GuaranteedAlarm
+from oodd_eval.metrics.cusum import Standardization
+from oodd_eval.names import select
+from oodd_eval.plugins.contract import StorableDetector
+from oodd_eval.plugins.discovery import Plugins, describe, discover
+from oodd_eval.plugins.state import pack, read_state, write_state
+from oodd_eval.results.record import gather
+from oodd_eval.scoring.plan import Unit, make_plan
+from oodd_interventions.acts import ACTS
+from oodd_interventions.loop import FittedDetector, Loop, Pair, oracle_arms, run_cell
+from oodd_interventions.situation import ActSpec
+
+DETECTOR: Final = "detector."
+"""Prefix of a detector's arrays in the file of its fit."""
+SCHEMA: Final = "oodd-eval/intervention/1"
+BASE: Final = 680
+"""Seeds of a study are this number in millions, and those after it: no split's, by default."""
+
+Names = str | Sequence[str]
+
+
+@dataclass(frozen=True, slots=True)
+class Interventions:
+    """What came of a study.
+
+    Attributes
+    ----------
+    output
+        Its directory.
+    cells
+        Raw cells as the files have them, in the order environments x conditions x acts x detectors.
+    reasons
+        Why a cell is missing, by ``ENV/DETECTOR`` or ``ENV/DETECTOR/CONDITION--ACT``.
+    """
+
+    output: Path
+    cells: Sequence[Mapping[str, Any]]
+    reasons: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class Study:
+    """What all cells share: split, directory, episodes and the level of alarms."""
+
+    split: Path
+    output: Path
+    seeds: int
+    base: int
+    level: float
+
+    def fit_file(self, unit: Unit) -> Path:
+        """Return the file of a detector's fit and alarm."""
+        name = f"{_plain_name(unit)}-{unit.fit_key}-{100 * self.level:g}.npz"
+        return self.output / "fits" / unit.environment / name
+
+
+@dataclass(frozen=True, slots=True)
+class StudyCell:
+    """A detector in an environment, a condition and an act."""
+
+    study: Study
+    unit: Unit
+    condition: Condition
+    strength: float | None
+    group: Group
+    act: ActSpec
+
+    @property
+    def name(self) -> str:
+        """Its name in reasons."""
+        return f"{name_of(self.unit)}/{self.condition}--{self.act.name}"
+
+    @property
+    def file(self) -> Path:
+        """Its file, which is whole or absent."""
+        directory = self.study.output / "cells" / self.unit.environment / _plain_name(self.unit)
+        return directory / f"{self.condition}--{self.act.name}.json"
+
+    def identity(self) -> dict[str, Any]:
+        """Return what it is of, as JSON has it."""
+        split, unit = load_split(self.study.split), self.unit
+        definition = _definition(split, unit.environment)
+        identity = {
+            "schema": SCHEMA,
+            "detector": unit.setting.detector,
+            "detector_version": unit.version,
+            "plugin": f"{unit.distribution}:{unit.plugin}",
+            "parameters": dict(unit.recorded),
+            "seed": unit.seed,
+            "horizon": unit.setting.horizon,
+            "environment": unit.environment,
+            "anomaly": str(self.condition),
+            "group": self.group,
+            "split": split.name,
+            "split_digest": split.digest,
+            "act": self.act.name,
+            "level": self.study.level,
+            "base": self.study.base,
+            "cap": definition.episode_cap or info_of(unit.environment).episode_cap,
+        }
+        plain: dict[str, Any] = json.loads(json.dumps(identity))
+        return plain
+
+    def read(self) -> dict[str, Any] | None:
+        """Return the cell that an earlier study of the same wrote; None without one."""
+        with suppress(OSError, ValueError, KeyError, TypeError):
+            cell: dict[str, Any] = json.loads(self.file.read_text(encoding="utf-8"))
+            same = cell | self.identity() == cell and len(cell["episodes"]) == self.study.seeds
+            return cell if same and cell["provenance"]["source"] == self.unit.source else None
+        return None
+
+
+def intervene(
+    detectors: Names,
+    environments: Names,
+    *,
+    split: str | Path = "mini",
+    kinds: Names | None = None,
+    acts: Names | None = None,
+    seeds: int = 10,
+    base: int = BASE,
+    level: float = 0.05,
+    parameters: Mapping[str, Any] | None = None,
+    jobs: int | None = None,
+    output: str | Path = "oodd-interventions",
+    observer: Progress = lambda _done, _total, _text: None,
+) -> Interventions:
+    """Run the closed loop with acts at alarms: what do the detectors' alarms save?
+
+    Cells that are in `output` already are taken from there.
+
+    Parameters
+    ----------
+    detectors, environments
+        Names, or texts as on the command line: comma lists and globs.
+    split
+        Name or path of a recorded split, whose training and calibration episodes, noise, cap and
+        strengths are used.
+    kinds
+        Kinds of anomalies or conditions; by default all of the split.
+    acts
+        Names of acts; by default all that suit.
+    seeds, base
+        Episodes a cell, and the millions of the first one's seed.
+    level
+        Share of nominal episodes with an alarm, at most.
+    parameters
+        As those of `oodd_eval.evaluate`.
+    jobs
+        Processes; by default one per core.
+    output
+        Directory of fits and cells.
+    observer
+        Called with the cells that are done, all cells, and what was done last.
+
+    Returns
+    -------
+    Interventions
+
+    Raises
+    ------
+    UsageError
+        For unknown names, and a split that was not recorded.
+    """
+    opened, plugins = load_split(split), discover()
+    register([spec for spec, _ in plugins.custom_specs.values()])
+    environment_names, kind_names = opened.select(_listed(environments), _listed(kinds or "all"))
+    for environment in environment_names:
+        _check_recorded(opened, environment, base)
+        measure(environment, load_policy(environment))
+    plan = make_plan(
+        plugins,
+        split=opened,
+        detectors=plugins.select(_listed(detectors)),
+        environments=environment_names,
+        anomalies=kind_names,
+        parameters=parameters,
+    )
+    offered = offered_acts(plugins)
+    act_names = select("act", _listed(acts or "all"), dict.fromkeys(act.name for act in offered))
+    study = Study(opened.path, Path(output), seeds, base, level)
+    cells = []
+    for environment in environment_names:
+        units = [unit for unit in plan.units if unit.environment == environment]
+        for condition in units[0].conditions if units else ():
+            group = plan.groups[condition.anomaly]
+            strength = plan.strengths[environment].get(condition)
+            suited = suiting(offered, act_names, environment, group)
+            cells += [
+                StudyCell(study, unit, condition, strength, group, act)
+                for act in suited
+                for unit in units
+            ]
+    with only_writer(study.output):
+        reasons = _run(cells, jobs, observer)
+    done = (cell.read() for cell in cells)
+    return Interventions(study.output, [cell for cell in done if cell is not None], reasons)
+
+
+def offered_acts(plugins: Plugins) -> list[ActSpec]:
+    """Return the shipped acts and those of plug-ins; several may share a name."""
+    acts = [*ACTS]
+    _ = plugins.offers  # loads all
+    for plugin in list(plugins.loaded.values()):
+        with plugins.blaming(plugin.point):
+            acts += plugin.listed("oodd_acts", ActSpec)
+    return acts
+
+
+def suiting(
+    acts: Sequence[ActSpec], names: Sequence[str], environment: str, group: Group
+) -> tuple[ActSpec, ...]:
+    """Return the named acts that suit: of one name the last one that is the environment's own."""
+    suited = [act for act in acts if act.name in names and group in act.groups]
+    general = {act.name: act for act in suited if not act.environments}
+    own = {act.name: act for act in suited if environment in act.environments}
+    return tuple((general | own).values())
+
+
+def _run(cells: Sequence[StudyCell], jobs: int | None, observer: Progress) -> dict[str, str]:
+    """Fit detectors, then run the cells that are missing; return why some could not be run."""
+    missing = [cell for cell in cells if cell.read() is None]
+    done, reasons = len(cells) - len(missing), dict[str, str]()
+    if not missing:
+        return reasons
+    with workers(jobs) as pool:
+        try:
+            units = {name_of(cell.unit): cell for cell in missing}
+            fits = {pool.submit(fit, cell.study, cell.unit): name for name, cell in units.items()}
+            for future in as_completed(fits):
+                reasons |= _failure(future, fits[future])
+                observer(done, len(cells), f"{fits[future]} fitted")
+            missing = [cell for cell in missing if name_of(cell.unit) not in reasons]
+            groups = itertools.groupby(
+                missing, lambda cell: (cell.unit.environment, cell.condition)
+            )
+            tasks = {
+                pool.submit(run_cells, batch): batch for batch in map(list, (g for _, g in groups))
+            }
+            for future in as_completed(tasks):
+                batch = tasks[future]
+                name = f"{batch[0].unit.environment}/{batch[0].condition}"
+                reasons |= _failure(future, name) or future.result()
+                done += len(batch)
+                observer(done, len(cells), name)
+        except BaseException:  # an interrupt, too, does not wait for what is running now
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    return reasons
+
+
+def _failure(future: Future[Any], name: str) -> dict[str, str]:
+    """Return why something in a process failed, by its name; nothing where it did not."""
+    error = future.exception()
+    if error is None:
+        return {}
+    if not isinstance(error, Exception) or isinstance(error, BrokenProcessPool):
+        raise error
+    return {name: describe(error)}
+
+
+def fit(study: Study, unit: Unit) -> None:
+    """Fit a detector and keep its state with its alarm, if it can hand its state over."""
+    detector, file = _handle(unit).detector, study.fit_file(unit)
+    if file.exists() or not isinstance(detector, StorableDetector):
+        return
+    fitted = _fitted(study, unit)
+    state = pack(cast(StorableDetector, fitted.handle.detector).state(), unit.setting.detector)
+    scale = fitted.rule.standardization
+    rule = [fitted.rule.threshold, *(astuple(scale) if scale else ())]
+    arrays = {DETECTOR + name: array for name, array in state.arrays.items()}
+    write_state(file, pack({"rule": rule, "detector": state.values(), **arrays}))
+
+
+def _fitted(study: Study, unit: Unit) -> FittedDetector:
+    """Fit a detector, and find the threshold of its alarm."""
+    handle, data = _handle(unit), _data(study.split, unit.environment)
+    handle.detector.fit([handle.visible(episode) for episode in data.train])
+    scores = [handle.scores(episode) for episode in data.calibration]
+    return FittedDetector(handle, Calibration.fit(scores, handle.alarm).rule(study.level))
+
+
+def _restored(study: Study, unit: Unit) -> FittedDetector:
+    """Return what `fit` kept; without a file, fit here."""
+    if not (file := study.fit_file(unit)).exists():
+        return _fitted(study, unit)
+    state, handle = read_state(file).state(), _handle(unit)
+    arrays = {n.removeprefix(DETECTOR): a for n, a in state.items() if n.startswith(DETECTOR)}
+    cast(StorableDetector, handle.detector).restore({**state["detector"], **arrays})
+    threshold, *scale = map(float, state["rule"])
+    rule = GuaranteedAlarm(Standardization(*scale) if scale else None, threshold)
+    return FittedDetector(handle, rule)
+
+
+def _handle(unit: Unit) -> DetectorHandle:
+    """Make a detector, not fitted."""
+    setting = unit.setting
+    call = (setting.detector, unit.alarm, unit.seed, setting.horizon, unit.parameters)
+    return DetectorHandle.make(*call, roles=unit.roles)
+
+
+_detectors: Final[dict[Path, FittedDetector]] = {}
+"""Fitted detectors of this process, by the files of their fits."""
+
+
+@functools.cache
+def _data(split: Path, environment: str) -> EnvironmentData:
+    return load_split(split).environment(environment)
+
+
+@functools.cache
+def _loop(split: Path, environment: str) -> Loop:
+    """Return policy, noise and cap of a split's environment, and a model of its readings."""
+    definition = _definition(load_split(split), environment)
+    policy = load_policy(environment)
+    setup = Setup(environment, policy, definition.episode_cap, definition.noise)
+    return Loop(setup, ReadingModel.fit(list(_data(split, environment).train)))
+
+
+@functools.cache
+def _twins(study: Study, environment: str) -> list[RecordedEpisode]:
+    """Record the nominal episodes of a study; short ones give way to the next seed."""
+    setup, first = _loop(study.split, environment).setup, study.base * 10**6
+    seeds = range(first, first + MOST_CANDIDATES * study.seeds)
+    recorded = map(setup.record, seeds)
+    whole = (twin for twin in recorded if twin.trajectory.transitions >= SHORTEST_TWIN)
+    twins = [*itertools.islice(whole, study.seeds)]
+    if len(twins) < study.seeds:
+        raise SimulationError(
+            f"of {len(seeds)} seeds of {environment} only {len(twins)} have nominal episodes of "
+            f"{SHORTEST_TWIN} transitions, expected {study.seeds}: train the policy more"
+        )
+    return twins
+
+
+def run_cells(cells: Sequence[StudyCell]) -> dict[str, str]:
+    """Run cells of one environment and condition, with shared arms; return why some failed."""
+    study, unit, condition = cells[0].study, cells[0].unit, cells[0].condition
+    loop, reasons = _loop(study.split, unit.environment), dict[str, str]()
+    pairs = []
+    for twin in _twins(study, unit.environment):
+        drawn = (condition.anomaly, cells[0].strength)
+        never = record_anomalous(loop.setup, *drawn, twin)
+        pairs.append(Pair(*drawn, cells[0].group, twin, never))
+    for _, same in itertools.groupby(cells, lambda cell: cell.act.name):
+        of_act = list(same)
+        oracles = oracle_arms(loop, pairs, of_act[0].act)
+        for cell in of_act:
+            start = time.perf_counter()
+            try:
+                file = study.fit_file(cell.unit)
+                if file not in _detectors:
+                    _detectors[file] = _restored(study, cell.unit)
+                outcome = run_cell(loop, pairs, oracles, cell.act, _detectors[file])
+            except Exception as error:  # noqa: BLE001  of foreign code
+                reasons[cell.name] = describe(error)
+                continue
+            facts = {"provenance": gather() | {"source": cell.unit.source}}
+            facts["seconds"] = round(time.perf_counter() - start, 3)
+            write_text(cell.file, json.dumps(cell.identity() | facts | outcome))
+    return reasons
+
+
+def name_of(unit: Unit) -> str:
+    """Return the name of a detector in an environment, in reasons."""
+    return f"{unit.environment}/{unit.setting.detector}"
+
+
+def _plain_name(unit: Unit) -> str:
+    """Return a detector's name as a directory can have it."""
+    return unit.setting.detector.replace(":", "-")
+
+
+def _definition(split: Split, environment: str) -> SplitDefinition:
+    return SplitDefinition(**split.manifest["definition"]).of(environment)
+
+
+def _check_recorded(split: Split, environment: str, base: int) -> None:
+    """Raise `UsageError` unless a split's environment was recorded, from other seeds."""
+    if layout.log_facts(split.manifest["environments"][environment]) is not None:
+        raise UsageError(
+            f"{environment} of split {split.name} was imported from logs: an intervention needs a "
+            "simulator, expected a split that was recorded"
+        )
+    if base == _definition(split, environment).seed_base:
+        raise UsageError(f"base={base} is that of split {split.name}: expected seeds of its own")
+
+
+def _listed(names: Names) -> str:
+    return names if isinstance(names, str) else ",".join(names)
