@@ -728,6 +728,50 @@ def attribution_contributions(
     return {"sensor_named": mean_of(named), "onset_error": mean_of(errors, median=True)}
 
 
+def naming_contributions(
+    namings: NDArray[np.int8],
+    faulty: NDArray[np.bool_],
+    kinds: Sequence[Collection[int]],
+    judged: NDArray[np.bool_],
+) -> dict[str, Contribution]:
+    """Return what the sets of parts that one cell's explanations name are worth.
+
+    Precision and recall are pooled over episodes. They are undefined where no part is at fault.
+
+    Parameters
+    ----------
+    namings
+        Of shape (n, 3, 1 + P): number of the kind, -1 without one, and 1 for each named part; at
+        the first alarm, 20 rows later, and of the readings that are largest at the alarm.
+    faulty
+        Parts at fault, of shape (n, P).
+    kinds
+        For each episode, numbers of the kinds that are right.
+    judged
+        Episodes with a first alarm from the effect on, of shape (n,).
+
+    Returns
+    -------
+    dict
+        Contributions by name, without the suffix of a level.
+    """
+    faulty = faulty & judged[:, None]
+    named = (namings[..., 1:] > 0) & faulty.any(axis=1)[:, None, None]
+    right = (named & faulty[:, None]).sum(axis=2, dtype=np.float64).T
+    sizes, total = named.sum(axis=2, dtype=np.float64).T, faulty.sum(axis=1, dtype=np.float64)
+    kind = namings[:, 0, 0].tolist()
+    hits = np.array([number in of for number, of in zip(kind, kinds, strict=True)], np.float64)
+    return {
+        "named_precision": Contribution(right[0], sizes[0]),
+        "named_recall": Contribution(right[0], total),
+        "named_precision_20": Contribution(right[1], sizes[1]),
+        "named_recall_20": Contribution(right[1], total),
+        "named_chance": Contribution(sizes[0] * total / faulty.shape[1], sizes[0]),
+        "named_largest": Contribution(right[2], total),
+        "kind_named": mean_of(np.where(judged & (namings[:, 0, 0] >= 0), hits, np.nan)),
+    }
+
+
 class Monitor:
     """Alarms of one episode as its scores come in, beside a running robot.
 

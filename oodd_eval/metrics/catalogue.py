@@ -35,6 +35,7 @@ HEADLINE: Final = "at_5pct"  # suffix of the level that tables show
 PAPER: Final = "The paper's alarm: meant to be false in about one row in ten"
 """Heading of all figures of alarms at the paper's threshold."""
 
+NAMED_AFTER: Final = (0, 20)  # rows from the alarm on at which parts are named
 FOUND_WITHIN: Final = (20, 100)  # rows from the effect on within which an episode counts as found
 UNDEFINED: Final = "\N{EN DASH}"  # printed for NaN
 

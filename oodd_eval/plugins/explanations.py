@@ -11,7 +11,13 @@ from oodd_eval.errors import ContractError
 from oodd_eval.plugins.contract import Detector, StreamingDetector
 
 Named: TypeAlias = NDArray[np.int32]
-"""The sensor that is named first at a row, and the onset: shape (2,)."""
+"""The sensor named first at a row, the onset, the number of the kind, and 1 for each named part.
+
+Of shape (3 + D + A,): sensors come before actuators. `KINDS` has the numbers; -1 without a naming.
+"""
+
+NAMED: Final = 0.5
+"""Least probability of a part that is named."""
 
 FLIPPED: Final = 0.05
 """Share of rows in which rounding may turn the sensor named first, or the onset, into another."""
@@ -21,6 +27,8 @@ _ROUNDING: Final = 1e-5  # of a sum of shares
 
 FAULT_KINDS: Final = ("sensor", "actuator", "body", "environment")
 """What a naming may say of where a fault is; an empty text where it says nothing."""
+
+KINDS: Final = ("", *FAULT_KINDS)
 
 
 class Naming(NamedTuple):
@@ -115,10 +123,17 @@ def explains(detector: object) -> bool:
 
 
 def explain_chunk(detector: Any, chunk: Sequence[Trajectory]) -> list[object]:
-    """Return explanations of the last rows of episodes, after all rows were checked."""
-    checked = (checked_explanation(detector.explain(episode), episode) for episode in chunk)
+    """Return what is `Named` at the last rows of episodes, after all rows were checked."""
+    return [_named(checked_explanation(detector.explain(x), x), x.action_dim) for x in chunk]
+
+
+def _named(explanation: Explanation, actions: int) -> Named:
+    naming = naming_of(explanation, actions)
     # Of several with the largest share the first one is named.
-    return [np.array([np.nan_to_num(s[-1]).argmax(), o[-1]], dtype=np.int32) for s, o, _ in checked]
+    sensor = np.nan_to_num(explanation.shares[-1]).argmax()
+    kind = KINDS.index(naming.kind) if explanation.naming else -1
+    parts = np.concatenate([naming.sensors, naming.actuators]) >= NAMED
+    return np.array([sensor, explanation.onsets[-1], kind, *parts], dtype=np.int32)
 
 
 def checked_explanation(returned: Any, trajectory: Trajectory) -> Explanation:
@@ -184,8 +199,8 @@ def checked_naming(returned: Any, sensors: int, actions: int) -> Naming:
         if bad.any():
             d = int(bad.argmax())
             raise ContractError(f"explain names {name} with {values[d]} at {d}, expected {range_}")
-    if naming.kind not in ("", *FAULT_KINDS):
-        expected = ", ".join(map(repr, ("", *FAULT_KINDS)))
+    if naming.kind not in KINDS:
+        expected = ", ".join(map(repr, KINDS))
         raise ContractError(f"explain names the kind {naming.kind!r}, expected one of {expected}")
     return naming
 
@@ -232,11 +247,15 @@ def _check_form(name: str, array: Any, form: str) -> None:
         raise ContractError(f"explain returned {name} as {actual}, expected {form}")
 
 
-def check_named(array: object, rows: int, sensors: int, where: str) -> Named:
-    """Return what came from a worker for the last of some rows; else `ContractError`."""
-    if not isinstance(array, np.ndarray) or array.dtype != np.int32 or array.shape != (2,):
+def check_named(array: object, trajectory: Trajectory, where: str) -> Named:
+    """Return what came from a worker for the last row of an episode; else `ContractError`."""
+    rows, sensors = trajectory.observations.shape
+    form = np.dtype(np.int32), (3 + sensors + trajectory.action_dim,)
+    if not isinstance(array, np.ndarray) or (array.dtype, array.shape) != form:
         raise ContractError(f"no explanation came back for {where}")
-    sensor, onset = array.tolist()
+    sensor, onset, kind, *parts = array.tolist()
+    if kind not in range(-1, len(KINDS)) or not {*parts} <= {0, 1}:
+        raise ContractError(f"no naming came back for {where}")
     if not (0 <= sensor < sensors and 0 <= onset < rows):
         raise ContractError(
             f"explain names sensor {sensor} and onset {onset} at t = {rows - 1} of {where}, where "

@@ -57,6 +57,9 @@ WRITING_SHARE: Final = 0.05  # of the time since the last writing that the next 
 EXPLAINED: Final = ("sensors", "onsets")
 """Datasets of explanations beside ``scores``: by row, the sensor named first, and the onset."""
 
+NAMINGS: Final = "namings"
+"""Dataset of the parts that explanations name beside ``scores``, by episode."""
+
 STREAM: Final = "stream"
 """Dataset of the surprise of the stream by row beside ``scores``."""
 
@@ -73,6 +76,7 @@ class ScoreFile:
     ``steps_scored``, the number of observations that ``seconds_score`` is for. `explained` are
     explanations by part, int32 arrays of shape (2, rows) with the sensors named first and the
     onsets, of anomalous parts and detectors that explain only: -1 but at first guaranteed alarms.
+    `namings` are the parts that are named there, see `alarms.naming_contributions` of the metrics.
     `stream` is the surprise of the stream by part, of episodes without twins only, see
     `oodd_eval.metrics.faults`. `voices` is what `oodd_eval.plugins.voices.VoiceCosts` is made of,
     of detectors that have any.
@@ -83,14 +87,16 @@ class ScoreFile:
     explained: dict[str, list[NDArray[np.int32]]] = field(default_factory=dict)
     stream: dict[str, list[NDArray[np.float64]]] = field(default_factory=dict)
     voices: dict[str, Any] = field(default_factory=dict)
+    namings: dict[str, NDArray[np.int8]] = field(default_factory=dict)
 
 
 class _StoredPart(NamedTuple):
-    """One part of a score file: scores, explanations and the stream, None where it has none."""
+    """One part of a score file: scores, explanations, stream and namings, or None for these."""
 
     sequences: list[NDArray[np.float64]]
     explained: list[NDArray[np.int32]] | None
     stream: list[NDArray[np.float64]] | None
+    namings: NDArray[np.int8] | None
 
 
 class ResultsDirectory:
@@ -226,8 +232,8 @@ class ResultsDirectory:
         """Keep the scores of a unit, beside parts of it that an earlier run has scored."""
         parts = self._all_parts(key)
         for part, sequences in scores.parts.items():
-            further = scores.explained.get(part), scores.stream.get(part)
-            parts[part] = _StoredPart(sequences, *further)
+            further = (scores.explained, scores.stream, scores.namings)
+            parts[part] = _StoredPart(sequences, *(of.get(part) for of in further))
         path, digests = self._score_paths(key)
         # In memory: HDF5 crashes where it cannot write, as on a full disk.
         image = io.BytesIO()
@@ -236,13 +242,16 @@ class ResultsDirectory:
             if voices := scores.voices or self.voices(key):
                 file.attrs[VOICES] = json.dumps(voices)
             for part in sorted(parts):
-                group, (sequences, explained, stream) = file.create_group(part), parts[part]
+                group = file.create_group(part)
+                sequences, explained, stream, namings = parts[part]
                 group["offsets"] = np.cumsum([0, *map(len, sequences)], dtype=np.int64)
                 columns = {"scores": np.concatenate([np.zeros(0), *sequences])}
                 if stream is not None:
                     columns[STREAM] = np.concatenate([np.zeros(0), *stream])
                 if explained is not None:
                     columns |= zip(EXPLAINED, np.concatenate(explained, axis=1), strict=True)
+                if namings is not None:
+                    columns[NAMINGS] = namings
                 for name, data in columns.items():
                     group.create_dataset(name, data=data, compression="gzip", shuffle=True)
         content = image.getvalue()
@@ -277,7 +286,7 @@ class ResultsDirectory:
         """
         try:
             with self._opened(key) as file:
-                parts, explained, stream = {}, {}, {}
+                parts, explained, stream, namings = {}, {}, {}, {}
                 for part, expected in lengths.items():
                     if file[part]["offsets"].shape != (len(expected) + 1,):
                         return None
@@ -289,13 +298,15 @@ class ResultsDirectory:
                         explained[part] = stored.explained
                     if stored.stream is not None:
                         stream[part] = stored.stream
+                    if stored.namings is not None:
+                        namings[part] = stored.namings
                 attributes = dict(file.attrs)
                 voices = dict(json.loads(attributes.pop(VOICES, "{}")))
                 cost = {name: float(value) for name, value in attributes.items()}
         except Exception:  # noqa: BLE001  h5py raises many kinds for damaged bytes
             return None
         cost = {name: value for name, value in cost.items() if 0 <= value < np.inf}
-        return ScoreFile(parts, cost, explained, stream, voices)
+        return ScoreFile(parts, cost, explained, stream, voices, namings)
 
     def voices(self, key: str) -> dict[str, Any]:
         """Return what a score file says of a detector's voices; empty where it says nothing."""
@@ -327,7 +338,7 @@ def _stored_part(part: h5py.Group) -> _StoredPart:
     stream = _column(part, STREAM) if STREAM in part else None
     if stream is not None and [*map(len, stream)] != [*map(len, sequences)]:
         raise SCORES.error("the stream has another number of rows than the scores")
-    return _StoredPart(sequences, _explained(part), stream)
+    return _StoredPart(sequences, _explained(part), stream, _namings(part))
 
 
 def _column(part: h5py.Group, name: str) -> list[NDArray[np.float64]]:
@@ -357,6 +368,17 @@ def _explained(part: h5py.Group) -> list[NDArray[np.int32]] | None:
         raise ValueError("explanations of another number of rows than scores")
     columns = np.array([part[name][:] for name in EXPLAINED], dtype=np.int32)
     return np.split(columns, part["offsets"][1:-1], axis=1)
+
+
+def _namings(part: h5py.Group) -> NDArray[np.int8] | None:
+    """Return the named parts of the episodes of a part, which earlier versions did not keep."""
+    if NAMINGS not in part:
+        return None
+    stored = child(part, NAMINGS, SCORES.error)
+    SCORES.check(NAMINGS, np.dtype(np.float64), stored.nbytes)
+    if stored.dtype != np.int8 or stored.shape[:2] != (len(part["offsets"]) - 1, 3):
+        raise SCORES.error(f"{NAMINGS} are {stored.dtype} of shape {stored.shape}")
+    return np.asarray(stored[:])
 
 
 class RecordWriter:

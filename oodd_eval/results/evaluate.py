@@ -5,8 +5,9 @@ Cells without twins have metrics of their own, see `oodd_eval.metrics.unpaired`.
 
 import contextlib
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import islice
 from types import MappingProxyType
 from typing import Any, Final
@@ -31,6 +32,7 @@ from oodd_eval.metrics.faults import StreamScale, readings
 from oodd_eval.metrics.recalibration import Draws, PairedScores, Recalibration
 from oodd_eval.metrics.unpaired import UnpairedScores
 from oodd_eval.plugins.contract import ROLLOUT_TOLERANCE, TOLERANCE, Scores
+from oodd_eval.plugins.explanations import KINDS
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
 from oodd_eval.results.identity import Cell
 from oodd_eval.results.record import NAN, CodedDraws, Metric, Record
@@ -166,8 +168,7 @@ def cell_metrics(
     condition: str = "",
     rate: float | None = None,
     rows: bool = False,
-    explained: Sequence[NDArray[np.int32]] = (),
-    corrupted: Sequence[Collection[int]] = (),
+    attribution: Callable[[GuaranteedAlarm], dict[str, Contribution]] = lambda _: {},
     draws: Mapping[str, NDArray[np.float64]] = MappingProxyType({}),
 ) -> tuple[dict[str, Metric], dict[str, Contribution]]:
     """Compute all metrics of one cell with their intervals, and their terms.
@@ -184,8 +185,8 @@ def cell_metrics(
         Without twins, rows in a second; None leaves out alarms per hour.
     rows
         Without twins, whether metrics of rows are computed, too.
-    explained, corrupted
-        With twins, see `attribution_contributions`; none leaves these out.
+    attribution
+        Returns what explanations are worth at the alarms of the headline's level.
     draws
         Deviations of metrics in resamples of the calibration episodes.
     """
@@ -210,10 +211,8 @@ def cell_metrics(
             else unpaired.unpaired_alarms(judged, rule, rate, rules.earlier.get(suffix, ()))
         )
         terms |= {f"{name}_{suffix}": c for name, c in of_level.items()}
-    if isinstance(cell, PairedScores) and explained and HEADLINE in levels:
-        episodes = cell.anomalous, explained, corrupted, cell.effects
-        named = alarms.attribution_contributions(*episodes, levels[HEADLINE])
-        terms |= {f"{name}_{HEADLINE}": c for name, c in named.items()}
+    if HEADLINE in levels:
+        terms |= {f"{name}_{HEADLINE}": c for name, c in attribution(levels[HEADLINE]).items()}
     terms |= {name: replace(terms[name], deviations=draws[name]) for name in terms if name in draws}
     if isinstance(cell, UnpairedScores):
         terms = {name: replace(c, recordings=cell.recordings) for name, c in terms.items()}
@@ -488,9 +487,8 @@ def _with_metrics(
         metrics, terms = cell_metrics(cell, rules, condition=condition, rows=rows, **settings)
         return replace(record, metrics=metrics, per_trajectory=_terms(terms))
     episodes, note = data.anomalous(record.condition), ""
-    explained = scores.explained.get(record.condition.part, [])
-    corrupted = [p.get("sensors", ()) for p in episodes.parameters] if explained else ()
-    metrics, terms = cell_metrics(cell, rules, explained=explained, corrupted=corrupted, **settings)
+    attribution = partial(_attribution, record, cell, data, scores)
+    metrics, terms = cell_metrics(cell, rules, attribution=attribution, **settings)
     if data.logs is not None:
         before = auc_before(*cell[:3])
         terms["auc_before"] = before
@@ -500,6 +498,41 @@ def _with_metrics(
                 del metrics[name], terms[name]
     brief = bool(episodes.brief)
     return replace(record, metrics=metrics, per_trajectory=_terms(terms), brief=brief, note=note)
+
+
+def _attribution(
+    record: Record,
+    cell: PairedScores,
+    data: EnvironmentData,
+    scores: ScoreFile,
+    rule: GuaranteedAlarm,
+) -> dict[str, Contribution]:
+    """Return what explanations of a cell are worth at its first alarms; nothing without any."""
+    part = record.condition.part
+    if not (explained := scores.explained.get(part)):
+        return {}
+    drawn = data.anomalous(record.condition).parameters[: len(explained)]
+    corrupted = [p.get("sensors", ()) for p in drawn]
+    terms = alarms.attribution_contributions(
+        cell.anomalous, explained, corrupted, cell.effects, rule
+    )
+    if (namings := scores.namings.get(part)) is None:
+        return terms
+    faults = [_fault(p, record.group, len(data.sensors)) for p in drawn]
+    faulty = [[j in parts for j in range(namings.shape[2] - 1)] for parts, _ in faults]
+    kinds = [kinds for _, kinds in faults]
+    judged = terms["onset_error"].denominator > 0
+    return terms | alarms.naming_contributions(namings, np.array(faulty), kinds, judged)
+
+
+def _fault(drawn: Mapping[str, Any], group: str, sensors: int) -> tuple[list[int], list[int]]:
+    """Return the parts at fault, actuators behind sensors, and numbers of the kinds it may be."""
+    parts, kinds = [*drawn.get("sensors", ())], ["body", "environment"]
+    if isinstance(actuator := drawn.get("actuator"), int):
+        parts.append(sensors + actuator)
+    if group == "sensor" or "actuator" in drawn:
+        kinds = ["sensor" if group == "sensor" else "actuator"]
+    return parts, [*map(KINDS.index, kinds)]
 
 
 LIKE: Final = (0.4, 0.6)

@@ -22,10 +22,12 @@ from oodd_eval.data.parts import (
 )
 from oodd_eval.data.trajectory import Trajectory, TrajectorySequence
 from oodd_eval.errors import ContractError, OutputError, ResultsError, SplitError, UsageError
+from oodd_eval.metrics.catalogue import NAMED_AFTER
 from oodd_eval.plugins import contract, explanations
 from oodd_eval.plugins.contract import Progress, ignore_progress
 from oodd_eval.plugins.discovery import Offer, describe, printable
 from oodd_eval.plugins.explanations import Named
+from oodd_eval.plugins.forecasting import FeatureScale
 from oodd_eval.plugins.isolation.child import Launcher, Limits, Stop
 from oodd_eval.plugins.isolation.supervisor import Outcome, run_isolated
 from oodd_eval.plugins.state import PackedState
@@ -148,8 +150,9 @@ class GroupedScoring:
     test seeds, the twins, or one anomaly (without twins: a part of any of these). It is scored
     apart from all others, in the order of the split, so that scores are the same bit for bit. A
     detector that explains is asked to in the same way, when all is scored: only the anomalous
-    trajectories with twins, up to the first guaranteed alarm, which metrics are of. Where rows are
-    streamed, groups hold all parts, see `mixed`, and nothing is explained.
+    trajectories with twins, up to the first guaranteed alarm, which metrics are of, and after all
+    of a group some rows longer. Where rows are streamed, groups hold all parts, see `mixed`, and
+    nothing is explained.
     """
 
     def __init__(self, job: UnitJob, progress: Progress = ignore_progress) -> None:
@@ -171,7 +174,8 @@ class GroupedScoring:
         self._groups = mixed(sizes) if job.streamed else groups(sizes)
         # Metrics with twins alone are of explanations, and there are no baseline rows then.
         self._explains = job.data.paired and not rows and not job.streamed
-        self._explained: dict[Member, int] = {}  # rows of each episode that is explained
+        # Of what is explained: the episode, which time after its alarm, and the rows until then.
+        self._asked: list[tuple[Member, int, int]] = []
         # What voices are compared on, and how.
         calibration = (Member(CALIBRATION, i) for i in range(sizes[CALIBRATION]))
         self._heard = first_rows(self._members(calibration))
@@ -287,23 +291,29 @@ class GroupedScoring:
         }
 
     def _alarmed(self, scores: Sequence[object], warm_up: object) -> Iterator[Iterator[Trajectory]]:
-        """Yield what is to be explained by group: episodes up to their first guaranteed alarm."""
+        """Yield what is to be explained by group: episodes up to their alarm, then rows longer."""
         if not self._explains:
             return
         try:
             firsts = first_alarms(self._checked(scores, warm_up), self._job.unit.alarm)
         except (ContractError, OverflowError):
             return  # The records say so.
-        self._explained = {
-            Member(part, i): first + 1
-            for part, rows in firsts.items()
-            for i, first in enumerate(rows)
-            if first is not None
-        }
+        self._asked = []
         for group in self._groups:
-            if alarmed := [member for member in group if member in self._explained]:
-                pairs = zip(alarmed, self._members(alarmed), strict=True)
-                yield (trajectory[: self._explained[member]] for member, trajectory in pairs)
+            asked = [
+                (Member(part, i), later, min(first + 1 + rows, self._lengths[part][i]))
+                for later, rows in enumerate(NAMED_AFTER)
+                for part, i in group
+                if part in firsts and (first := firsts[part][i]) is not None
+            ]
+            if asked:
+                self._asked += asked
+                yield map(self._asked_rows, asked)
+
+    def _asked_rows(self, asked: tuple[Member, int, int]) -> Trajectory:
+        """Return the rows of an episode that an explanation is asked of."""
+        (x,) = self._members(asked[:1])
+        return x[: asked[2]]
 
     def _members(self, group: Iterable[Member]) -> Iterator[Trajectory]:
         return (self._visible(self._sets[part][i]) for part, i in group)
@@ -326,14 +336,18 @@ class GroupedScoring:
             for part, sequences in parts.items()
             if part not in _NOMINAL
         }
-        # They come in the order of the groups.
-        again = [member for member in chain(*self._groups) if member in self._explained]
-        for member, array in zip(again, explained, strict=True):
-            (part, i), rows = member, self._explained[member]
-            label = f"{self._job.unit.environment}/{part}[{i}]"
-            sensors = len(self._job.data.sensors)
-            named[part][i][:, rows - 1] = explanations.check_named(array, rows, sensors, label)
-        return ScoreFile(parts, {}, named)
+        data, scale = self._job.data, FeatureScale.fit(self._train)
+        shape = 1 + len(NAMED_AFTER), 1 + len(data.sensors) + len(data.actions)
+        namings = {part: np.zeros((len(rows), *shape), np.int8) for part, rows in named.items()}
+        for asked, array in zip(self._asked, explained, strict=True):
+            ((part, i), later, rows), x = asked, self._asked_rows(asked)
+            checked = explanations.check_named(array, x, f"{data.id}/{part}[{i}]")
+            namings[part][i, later, : len(checked) - 2] = checked[2:]
+            if not later:
+                named[part][i][:, rows - 1] = checked[:2]
+                largest = np.argsort(-np.abs(scale(x)[-1]), kind="stable")
+                namings[part][i, -1, 1 + largest[: checked[3:].sum()]] = 1
+        return ScoreFile(parts, {}, named, namings=namings)
 
     def _checked(
         self, scores: Sequence[object], warm_up: object

@@ -5,11 +5,15 @@ import numpy as np
 import pytest
 from helpers_plugins import install
 
-from oodd_eval import Explanation, Trajectory, evaluate, load_split
+from oodd_eval import Explanation, Naming, Trajectory, evaluate, load_split
 from oodd_eval.cli.main import main
 from oodd_eval.data.parts import CALIBRATION, TWINS
 from oodd_eval.errors import ContractError
-from oodd_eval.metrics.alarms import GuaranteedAlarm, attribution_contributions
+from oodd_eval.metrics.alarms import (
+    GuaranteedAlarm,
+    attribution_contributions,
+    naming_contributions,
+)
 from oodd_eval.metrics.auc import mean_of
 from oodd_eval.metrics.bootstrap import bootstrap_weights, resampled
 from oodd_eval.metrics.catalogue import ATTRIBUTION
@@ -18,7 +22,7 @@ from oodd_eval.results.directory import ResultsDirectory, ScoreFile
 from oodd_eval.results.evaluate import rescore, stored_scores
 
 NAN = float("nan")
-SENSOR_NAMED, ONSET_ERROR = ATTRIBUTION
+SENSOR_NAMED, ONSET_ERROR, PRECISION, RECALL, _, _, CHANCE, LARGEST, KIND_NAMED = ATTRIBUTION
 
 PLUGIN = '''
 import os
@@ -130,6 +134,35 @@ def test_metrics_of_hand_made_explanations():
     assert all(np.isnan(c.value) and c.n == 0 for c in found.values())
 
 
+def test_metrics_of_hand_made_namings():
+    """Three sensors and two actuators; the last two episodes have no true part and no alarm."""
+    alarm = [[1, 1, 1, 0, 0, 0], [2, 0, 0, 0, 1, 0], [0, 0, 0, 0, 0, 0], [4, 1, 0, 0, 0, 0],
+             [1, 1, 0, 0, 0, 0]]  # fmt: skip
+    later = [[1, 1, 0, 0, 0, 0], [2, 0, 0, 0, 1, 1], [1, 0, 0, 1, 0, 0], [4] + [0] * 5, [-1] * 6]
+    largest = [[0, 0, 1, 1, 0, 0], [0, 1, 0, 0, 0, 0], [0] * 6, [0] * 6, [0] * 6]
+    namings = np.array([alarm, later, largest], np.int8).swapaxes(0, 1)
+    faulty = np.array(
+        [[1, 0, 1, 0, 0], [0, 0, 0, 1, 0], [0, 0, 1, 0, 0], [0] * 5, [1, 0, 0, 0, 0]], bool
+    )
+    kinds, judged = [[1], [2], [1], [3, 4], [1]], np.array([1, 1, 1, 1, 0], bool)
+    found = naming_contributions(namings, faulty, kinds, judged)
+    assert [f"{name}_at_5pct" for name in found] == [*ATTRIBUTION[2:]]
+    for name, right, total in (
+        ("named_precision", [1, 1, 0, 0, 0], [2, 1, 0, 0, 0]),
+        ("named_recall", [1, 1, 0, 0, 0], [2, 1, 1, 0, 0]),
+        ("named_precision_20", [1, 1, 1, 0, 0], [1, 2, 1, 0, 0]),
+        ("named_recall_20", [1, 1, 1, 0, 0], [2, 1, 1, 0, 0]),
+        ("named_chance", [2 * 2 / 5, 1 / 5, 0, 0, 0], [2, 1, 0, 0, 0]),
+        ("named_largest", [1, 0, 0, 0, 0], [2, 1, 1, 0, 0]),
+        ("kind_named", [1, 1, 0, 1, 0], [1, 1, 1, 1, 0]),
+    ):
+        assert found[name].numerator.tolist() == right, name
+        assert found[name].denominator.tolist() == total, name
+        assert found[name].numerator.dtype == found[name].denominator.dtype == np.float64
+    namings[:, 0, 0] = -1  # of a detector that names no kinds
+    assert np.isnan(naming_contributions(namings, faulty, kinds, judged)["kind_named"].value)
+
+
 @pytest.mark.parametrize("values", [[5.0], [1.0, 2.0, NAN, 8.0, 3.0], [4.0, NAN, 4.0, 0.0], [NAN]])
 def test_medians_of_resamples_are_those_of_what_was_drawn(values):
     weights = bootstrap_weights(len(values), resamples=200)
@@ -157,9 +190,14 @@ class Two:
 
 
 def test_the_sensor_with_the_largest_share_is_kept():
-    (found,) = explain_chunk(Two(), [Trajectory(np.zeros((4, 2)))])
+    (found,) = explain_chunk(Two(), [Trajectory(np.zeros((4, 2)), np.zeros((3, 1)))])
     assert found.dtype == np.int32
-    assert found.tolist() == [0, 1]
+    assert found.tolist() == [0, 1, -1, 1, 0, 0]  # row 3 is the first sensor's
+    two = Two()
+    naming = Naming(np.array([0.4, 0.5]), np.array([0.9]), np.zeros(2), "body")
+    two.explain = lambda x: Two.explain(two, x)._replace(naming=naming)
+    (found,) = explain_chunk(two, [Trajectory(np.zeros((4, 2)), np.zeros((3, 1)))])
+    assert found.tolist() == [0, 1, 3, 0, 1, 1]
     assert explains(Two())
     assert not explains(GuaranteedAlarm(None, 1.0))
 
@@ -171,17 +209,21 @@ SCORES = np.array([NAN, *[0.0] * 39])
 @pytest.mark.parametrize(
     ("found", "message"),
     [
-        (np.array([1, 3]), "no explanation came back"),
-        (np.array([1, 3, 0], np.int32), "no explanation came back"),
+        (np.array([1, 3, 0, 0, 1, 1]), "no explanation came back"),
+        (np.array([1, 3], np.int32), "no explanation came back"),
+        (np.array([1, 3, 0, 0, 1], np.int32), "no explanation came back"),
         ("WHOLE", "no explanation came back"),
-        (np.array([2, 1], np.int32), "names sensor 2 and onset 1 at t = 3"),
-        (np.array([0, 4], np.int32), "names sensor 0 and onset 4 at t = 3"),
-        (np.array([0, -1], np.int32), "names sensor 0 and onset -1 at t = 3"),
+        (np.array([1, 3, 5, 0, 1, 1], np.int32), "no naming came back"),
+        (np.array([1, 3, -2, 0, 1, 1], np.int32), "no naming came back"),
+        (np.array([1, 3, 0, 0, 2, 1], np.int32), "no naming came back"),
+        (np.array([2, 1, 0, 0, 1, 1], np.int32), "names sensor 2 and onset 1 at t = 3"),
+        (np.array([0, 4, 0, 0, 1, 1], np.int32), "names sensor 0 and onset 4 at t = 3"),
+        (np.array([0, -1, 0, 0, 1, 1], np.int32), "names sensor 0 and onset -1 at t = 3"),
     ],
 )
 def test_what_cannot_be_an_explanation_is_refused(found, message):
     with pytest.raises(ContractError, match=message):
-        check_named(found, 4, 2, "hopper/test/iid[0]")
+        check_named(found, Trajectory(np.zeros((4, 2)), np.zeros((3, 1))), "hopper/test/iid[0]")
 
 
 # Storage
@@ -192,7 +234,9 @@ def test_explanations_are_stored_beside_scores_and_read_back(tmp_path):
     results.prepare()
     scores, named = [SCORES, SCORES[:5]], [WHOLE, WHOLE[:, :5]]
     nominal = {CALIBRATION: scores, TWINS: scores}
-    results.write_scores("a", ScoreFile({**nominal, "test/iid": scores}, {}, {"test/iid": named}))
+    namings = {"test/iid": np.arange(2 * 3 * 4).reshape(2, 3, 4).astype(np.int8)}
+    parts = {**nominal, "test/iid": scores}
+    results.write_scores("a", ScoreFile(parts, {}, {"test/iid": named}, namings=namings))
     # A later run adds a part, without explanations as of an earlier version.
     results.write_scores("a", ScoreFile({**nominal, "test/drift": scores}, {}))
     lengths = {part: [40, 5] for part in (*nominal, "test/iid", "test/drift")}
@@ -201,14 +245,26 @@ def test_explanations_are_stored_beside_scores_and_read_back(tmp_path):
     for one, other in zip(found.explained["test/iid"], named, strict=True):
         assert one.dtype == np.int32
         assert np.array_equal(one, other)
+    assert list(found.namings) == ["test/iid"]
+    assert found.namings["test/iid"].dtype == np.int8
+    assert np.array_equal(found.namings["test/iid"], namings["test/iid"])
     with h5py.File(tmp_path / "scores/a.h5") as file:
-        assert {*file["test/iid"]} == {"scores", "offsets", "sensors", "onsets"}
+        assert {*file["test/iid"]} == {"scores", "offsets", "sensors", "onsets", "namings"}
         assert {*file["test/drift"]} == {*file[TWINS]} == {"scores", "offsets"}
     with h5py.File(tmp_path / "scores/a.h5", "r+") as file:
         for name in ("sensors", "onsets"):
             del file["test/iid"][name]
             file["test/iid"][name] = np.zeros(44, dtype=np.int32)
     assert results.scores("a", lengths) is None
+
+
+@pytest.mark.parametrize("namings", [np.zeros((1, 3, 4), np.int8), np.zeros((2, 3, 4))])
+def test_namings_of_another_form_are_not_read(tmp_path, namings):
+    results = ResultsDirectory(tmp_path)
+    results.prepare()
+    parts = {"test/iid": [SCORES, SCORES[:5]]}
+    results.write_scores("a", ScoreFile(parts, {}, namings={"test/iid": namings}))
+    assert results.scores("a", {"test/iid": [40, 5]}) is None
 
 
 # A run
@@ -221,7 +277,7 @@ def test_records_have_the_metrics_of_detectors_that_explain_only(world):
         assert not {*ATTRIBUTION} & (record.metrics.keys() | record.per_trajectory.keys())
     for record in found["tells"]:
         assert record.ok, record.reason
-        named, error = (record.metrics[name] for name in ATTRIBUTION)
+        named, error = (record.metrics[name] for name in ATTRIBUTION[:2])
         delays = record.per_trajectory["delay_at_5pct"]
         # It names the row of the alarm, so that its error is the delay.
         assert np.array_equal(record.per_trajectory[ONSET_ERROR], delays)
@@ -233,6 +289,16 @@ def test_records_have_the_metrics_of_detectors_that_explain_only(world):
         assert named.n == (error.n if record.group == "sensor" else 0)
     iid = next(r for r in found["tells"] if r.anomaly == "iid")
     assert iid.metrics[SENSOR_NAMED].value > 0.5
+    precision, recall, chance, largest = (
+        iid.metrics[name] for name in (PRECISION, RECALL, CHANCE, LARGEST)
+    )
+    assert 0 < chance.value < precision.value <= 1
+    assert 0 < recall.value <= 1
+    assert 0 <= largest.value <= 1
+    assert recall.low <= recall.value <= recall.high
+    assert np.isnan(iid.value(KIND_NAMED))  # it names no kinds
+    gravity = next(r for r in found["tells"] if r.anomaly == "gravity")
+    assert all(np.isnan(gravity.value(name)) for name in ATTRIBUTION[2:])
 
 
 def test_anomalous_episodes_are_explained_up_to_their_alarms_each_group_in_a_process(world):
@@ -247,15 +313,27 @@ def test_anomalous_episodes_are_explained_up_to_their_alarms_each_group_in_a_pro
         if part not in (CALIBRATION, TWINS)
     }
     alarms = [first for rows in firsts.values() for first in rows if first is not None]
-    assert sorted(n for _, n in calls) == sorted(first + 1 for first in alarms)
+    prefixes = [
+        min(first + n, len(scores))
+        for part, rows in firsts.items()
+        for first, scores in zip(rows, file.parts[part], strict=True)
+        if first is not None
+        for n in (1, 21)
+    ]
+    assert sorted(n for _, n in calls) == sorted(prefixes)
+    assert len(prefixes) == 2 * len(alarms)
     assert len({pid for pid, _ in calls}) == sum(
         rows != [None] * len(rows) for rows in firsts.values()
     )
-    assert {*file.explained} == {*firsts}
+    assert {*file.explained} == {*file.namings} == {*firsts}
     for part, rows in firsts.items():
         for first, scores, named in zip(rows, file.parts[part], file.explained[part], strict=True):
             assert named.shape == (2, len(scores))
             assert np.flatnonzero(named[1] >= 0).tolist() == ([] if first is None else [first])
+        sensors = file.namings[part][:, :, 1:5]
+        assert file.namings[part].shape == (len(rows), 3, 1 + 4 + 2)
+        assert (sensors.sum(axis=2) > 0).tolist() == [[first is not None] * 3 for first in rows]
+        assert (sensors[:, 0].sum(axis=1) == sensors[:, 2].sum(axis=1)).all()
 
 
 def test_scores_of_a_file_without_explanations_are_scored_as_ever(world, tmp_path):
@@ -266,7 +344,8 @@ def test_scores_of_a_file_without_explanations_are_scored_as_ever(world, tmp_pat
     (tmp_path / "scores" / f"{key}.h5").write_bytes(content)
     with h5py.File(tmp_path / "scores" / f"{key}.h5", "r+") as file:
         for anomaly in ("iid", "drift", "gravity"):
-            del file[f"test/{anomaly}/sensors"], file[f"test/{anomaly}/onsets"]
+            for dataset in ("sensors", "onsets", "namings"):
+                del file[f"test/{anomaly}/{dataset}"]
     for old, new in zip(
         found["tells"], rescore(found["tells"], ResultsDirectory(tmp_path), load_split("mini")),
         strict=True,

@@ -239,8 +239,8 @@ class _UnitRun:
                     channel.send_trajectory(trajectory)
             self._cost(channel)
             for trajectory in chunk:
-                most = HEADER_BYTES + ROW_BYTES * len(trajectory)
-                arrays.append(channel.receive_array(most))
+                rows = len(trajectory) + trajectory.observation_dim + trajectory.action_dim
+                arrays.append(channel.receive_array(HEADER_BYTES + ROW_BYTES * rows))
 
     def _hear(self, channel: Channel, group: Iterable[Trajectory], order: str) -> None:
         episodes = [*group]

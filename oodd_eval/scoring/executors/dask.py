@@ -51,7 +51,8 @@ except ImportError as error:
 
 CONNECT_SECONDS: Final = 10.0
 WORKERLESS_SECONDS: Final = 60.0  # for which units wait while there is no worker
-_FILE: Final = ("parts", "cost", "explained", "voices")  # what comes back of a unit's score file
+# What comes back of a unit's score file.
+_FILE: Final = ("parts", "cost", "explained", "voices", "namings")
 
 Message = dict[str, Any]
 
