@@ -12,7 +12,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from oodd_eval import DetectorSpec, Explanation, Trajectory
+from oodd_eval import DetectorSpec, Explanation, Naming, Trajectory
 from oodd_eval.errors import NotFittedError, TrajectoryError
 from oodd_eval.plugins.parameters import declared_by
 
@@ -59,7 +59,13 @@ class Good:
         shares = change / change.sum(axis=1, keepdims=True)
         shares[undefined] = np.nan
         onsets = np.where(undefined, -1, np.maximum(np.arange(len(x)) - 1, 0))
-        return Explanation(shares, onsets)
+        return Explanation(shares, onsets, self.naming(shares[-1], x))
+
+    def naming(self, shares, x):
+        """Name the sensors with more than their part of the latest change."""
+        sensors = (np.nan_to_num(shares) * len(shares) > 1) / 1.0
+        sizes = np.full(len(shares), np.nan)
+        return Naming(sensors, np.zeros(x.action_dim), sizes, "sensor" if sensors.any() else "")
 
     def reset(self):
         self.seen, self.done = [], []
@@ -74,8 +80,8 @@ class Good:
         return Trajectory(self.seen, np.array(self.done) if self.done else np.empty((0, 1)))
 
     def explain_last(self):
-        shares, onsets, _ = self.explain(self.lived())
-        return shares[-1], int(onsets[-1])
+        shares, onsets, *naming = self.explain(self.lived())
+        return shares[-1], int(onsets[-1]), *naming
 
     def state(self):
         return {"std": self.std_}
@@ -229,7 +235,7 @@ for name, message, change in (
     ("OneShort", "80 scores for an episode, fitted with horizon 1", lambda _, s, x: s[1:]),
     ("SecretWarmUp", "nan at t = 1", undefined(0, 3)),
 ):
-    fails = {"horizon", "baseline"} if name == "OneShort" else ()
+    fails = {"horizon", "baseline", "naming"} if name == "OneShort" else ()
     alters("score", change, "scores", name, message, also=fails)
 
 for check, name, message, change in (
@@ -278,6 +284,25 @@ alters(
     "explain",
     "LateWithWhy",
     "explain_last gives other onsets than explain, first at t",
+)
+for name, message, change in (
+    ("OtherPartsBesideARobot", "explain_last names other kind:", lambda n: n._replace(kind="body")),
+    ("NoPartsBesideARobot", "explain_last names other ", lambda _: None),
+):
+    alters(
+        "explain_last",
+        lambda _, last, change=change: (*last[:2], change(last[2])),
+        "naming",
+        name,
+        message,
+    )
+alters(
+    "explain",
+    lambda _, e, x: (*e[:2], e[2]._replace(sensors=100 * e[2].sensors)),
+    "naming",
+    "PartsInPercent",
+    "explain names sensors with 100.0 at",
+    also={"explain"},
 )
 alters(
     "score_many",
@@ -377,6 +402,19 @@ class SharesOfTheWhole(Good):
         return np.where(np.isnan(shares), np.nan, mean), onsets
 
 
+@breaks("naming", "explain after the explanation of later rows names other sensors:")
+class KnowsWhatItExplained(Good):
+    """Names the parts of the latest row of an episode that it has ever explained."""
+
+    known: ClassVar = {}
+
+    def naming(self, shares, x):
+        start = x.observations[0].tobytes()
+        latest = max(self.known.get(start, (0,)), (len(x), shares.tolist()))
+        self.known[start] = latest
+        return super().naming(np.array(latest[1]), x)
+
+
 @breaks("streaming", "two copies share what they remember of an episode: keep it in attributes")
 class Together(Good):
     memory: ClassVar = []
@@ -412,7 +450,7 @@ class HalfStreaming(Good):
 @breaks(
     "short-trajectories",
     "score of an episode of 1 observation raised IndexError",
-    also={"prefix", "streaming", "explain"},
+    also={"prefix", "streaming", "explain", "naming"},
 )
 class NeedsTwo(Good):
     def score(self, x):

@@ -44,7 +44,14 @@ from oodd_eval.plugins.contract import (
     copied,
     takes_progress,
 )
-from oodd_eval.plugins.explanations import FLIPPED, Explanation, checked_explanation, explains
+from oodd_eval.plugins.explanations import (
+    FLIPPED,
+    Explanation,
+    Naming,
+    checked_explanation,
+    explains,
+    naming_of,
+)
 from oodd_eval.plugins.isolation.worker import reason_of
 from oodd_eval.plugins.parameters import parameters_of
 from oodd_eval.plugins.state import PackedState, pack, read_state, write_state
@@ -358,16 +365,9 @@ def test_explain(trial: Trial) -> None:
             f"the first {n} of {len(trajectory)} observations alone have other {different[0]}: "
             "explain may use nothing after a row's time"
         )
-    if not hasattr(trial.fitted(), "explain_last"):
+    if not (latest := _streamed_explanations(trial, trajectory)):
         return
-    detector = offered(trial.fitted(), "reset", "update")
-    rows = []
-    with doing("update and explain_last"):
-        detector.reset()
-        for row in zip(trajectory.observations, [None, *trajectory.actions], strict=True):
-            detector.update(*row)
-            rows.append(detector.explain_last())
-        shares, onsets = np.stack([row[0] for row in rows]), np.array([int(row[1]) for row in rows])
+    shares, onsets = (np.concatenate([e[i] for e in latest]) for i in (0, 1))
     different = _difference(Explanation(shares, onsets), expected)
     assert not different, (
         f"explain_last gives other {different[0]} than explain, first at t = {different[1]}: "
@@ -380,6 +380,51 @@ def _explanation(trial: Trial, trajectory: Trajectory) -> Explanation:
     with doing("explain"):
         returned = detector.explain(trajectory)
     return checked_explanation(returned, trajectory)
+
+
+def test_naming(trial: Trial) -> None:
+    """Parts named at a row are the same when later rows were explained before, and in a stream."""
+    if not explains(trial.fitted()):
+        pytest.skip("has no explain")
+    trajectory = noisy_from(trial.nominal(1)[0], trial.rows // 3)
+    rows = range(trial.horizon + 1, len(trajectory), len(trajectory) // 10)
+    before = [_explanation(trial, trajectory[:n]) for n in rows]
+    if _explanation(trial, trajectory).naming is None:
+        pytest.skip("names no parts, but shares alone")
+    after = [_explanation(trial, trajectory[:n]) for n in rows]
+    subject = "explain after the explanation of later rows"
+    _assert_same_parts(after, before, subject, trajectory.action_dim)
+    if latest := _streamed_explanations(trial, trajectory):
+        latest = [latest[n - 1] for n in rows]
+        _assert_same_parts(latest, before, "explain_last", trajectory.action_dim)
+
+
+def _streamed_explanations(trial: Trial, trajectory: Trajectory) -> list[Explanation]:
+    """Return what explain_last says after each row of an episode; nothing without it."""
+    latest: list[Explanation] = []
+    if not hasattr(trial.fitted(), "explain_last"):
+        return latest
+    detector = offered(trial.fitted(), "reset", "update")
+    with doing("update and explain_last"):
+        detector.reset()
+        for row in zip(trajectory.observations, [None, *trajectory.actions], strict=True):
+            detector.update(*row)
+            shares, onset, *naming = detector.explain_last()
+            latest.append(Explanation(shares[None], np.array([int(onset)]), *naming))
+    return latest
+
+
+def _assert_same_parts(
+    latest: Sequence[Explanation], expected: Sequence[Explanation], subject: str, actions: int
+) -> None:
+    """Fail where other parts are named than expected, but for the few that rounding may turn."""
+    namings = ([naming_of(e, actions) for e in explanations] for explanations in (latest, expected))
+    for name, *pair in zip(Naming._fields, *(zip(*n, strict=True) for n in namings), strict=True):
+        a, b = map(np.array, pair)
+        near = a == b if name == "kind" else np.isclose(a, b, TOLERANCE, TOLERANCE, equal_nan=True)
+        assert (~near).sum() <= FLIPPED * near.size, (
+            f"{subject} names other {name}: expected those of explain for the rows until then"
+        )
 
 
 def _difference(rows: Explanation, expected: Explanation) -> tuple[str, int] | None:
