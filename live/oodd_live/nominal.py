@@ -37,12 +37,15 @@ class Nominal:
         Of the first rows of every episode; None where none are declared.
     roles
         Of the sensors, one each; empty where all are just measured.
+    actions
+        Names of the actions; empty where they have none.
     """
 
     sensors: list[str]
     offsets: Floats
     baseline: Baseline | None
     roles: tuple[str, ...] = ()
+    actions: tuple[str, ...] = ()
 
     def judged(self, trajectory: Trajectory) -> Trajectory:
         """Return the rows of an episode that are judged, brought to training's."""
@@ -111,6 +114,7 @@ class NominalData:
         further: list[Trajectory] = []
         recorded = True
         others: Sequence[Sequence[Hashable] | None] = (None, None)
+        actions: tuple[str, ...] = ()
         if isinstance(train, EnvironmentData):
             if calibration is not None:
                 raise UsageError(
@@ -121,6 +125,7 @@ class NominalData:
             train, calibration, sensors = data.train, data.calibration, sensors or data.sensors
             recordings = data.recordings(CALIBRATION) if recordings is None else recordings
             others = data.recordings(TRAIN), data.recordings(TWINS)
+            actions = tuple(action.name for action in data.actions)
             recorded = facts is not None and facts.order == "recorded"
             if facts is not None:
                 further, rate = list(data.twins), rate or facts.rate
@@ -144,7 +149,7 @@ class NominalData:
         if rows:
             check_baseline(map(len, calibrating), rows, "calibration")
         base = Baseline.fit(training, rows) if rows else None
-        nominal = Nominal(names, subtracted, base, roles_of(sensors or ()))
+        nominal = Nominal(names, subtracted, base, roles_of(sensors or ()), actions)
         return cls(training, calibrating, further, nominal, rate, recorded, recordings, others)
 
     def findings(self) -> list[PromiseFinding]:

@@ -6,13 +6,14 @@ between them.
 """
 
 import math
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, field
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from oodd_eval.errors import UsageError
+from oodd_eval.plugins.explanations import NAMED
 
 Floats = NDArray[np.float64]
 
@@ -22,6 +23,7 @@ TAIL: Final = 0.25
 """Share of the episodes, those with the largest statistics, that the tail is estimated from."""
 OK, WARN, ERROR, STALE = range(4)
 """Levels of ROS 2's DiagnosticStatus."""
+_LISTED: Final = 4  # named parts in a line
 _NORMAL: Final = 1.96  # a 95 % interval of a normal distribution
 
 
@@ -127,6 +129,13 @@ class Reading:
         Sensors with a fault, by name: ``"missing"``, ``"frozen"`` or ``"out of range"``; for all at
         once ``{"observation": "missing"}``, ``"repeated"`` or ``"irregular"``; for actions
         ``{"action": "missing"}`` or ``"late"``.
+    parts
+        In an alarm, probability of each part of being at fault, the largest first: sensors and
+        actuators by name. Parts of one half or more are named, those of 0 are left out; empty where
+        nothing is known. Of a detector that gives shares alone, the fewest sensors that carry half.
+    kind
+        In an alarm, where the fault is: ``"sensor"``, ``"actuator"``, ``"body"`` or
+        ``"environment"``; empty where that is not known.
     """
 
     t: int
@@ -137,6 +146,8 @@ class Reading:
     sensors: dict[str, float]
     onset: int | None
     faults: dict[str, str]
+    parts: dict[str, float] = field(default_factory=dict)
+    kind: str = ""
 
     def __eq__(self, other: object) -> bool:
         # Tuples take a NaN, which is always this one, for equal to itself.
@@ -177,7 +188,9 @@ class Reading:
             **{n: _text(getattr(self, n)) for n in ("score", "statistic", "threshold")},
             "alarm": str(self.alarm).lower(),
             "onset": "" if self.onset is None else str(self.onset),
+            "kind": self.kind,
         }
+        values |= {f"part {part}": f"{p:.3f}" for part, p in self.parts.items()}
         values |= {f"sensor {sensor}": f"{share:.3f}" for sensor, share in self.sensors.items()}
         values |= {f"fault {source}": fault for source, fault in self.faults.items()}
         status = {
@@ -216,6 +229,8 @@ class EpisodeAlarm:
         where nothing is known.
     faults
         Sensors with a fault in the first row, as those of a `Reading`.
+    parts, kind
+        What is at fault as seen at the first row, as those of a `Reading`.
     """
 
     first: int
@@ -223,6 +238,8 @@ class EpisodeAlarm:
     onset: int | None
     sensors: dict[str, float]
     faults: dict[str, str]
+    parts: dict[str, float] = field(default_factory=dict)
+    kind: str = ""
 
     def __str__(self) -> str:
         """Return one line: its rows, what is at fault, and since when."""
@@ -231,11 +248,13 @@ class EpisodeAlarm:
 
 def _causes(alarm: Reading | EpisodeAlarm) -> list[str]:
     """Return what is at fault and since when, in words."""
-    parts = [f"{name} {fault}" for name, fault in alarm.faults.items()]
-    sensor = next(iter(alarm.sensors), "")
-    if sensor and sensor not in alarm.faults:
-        parts.append(f"{sensor} {alarm.sensors[sensor]:.0%}")
-    return parts if alarm.onset is None else [*parts, f"since row {alarm.onset}"]
+    causes = [f"{name} {fault}" for name, fault in alarm.faults.items()]
+    if alarm.kind and not causes:
+        causes.append(f"{alarm.kind} fault")
+    named = [name for name, p in alarm.parts.items() if p >= NAMED] or [*alarm.sensors][:1]
+    shares = {name: f"{name} {share:.0%}" for name, share in alarm.sensors.items()}
+    causes += [shares.get(name, name) for name in named if name not in alarm.faults][:_LISTED]
+    return causes if alarm.onset is None else [*causes, f"since row {alarm.onset}"]
 
 
 def _text(number: float) -> str:

@@ -11,6 +11,7 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
+from oodd_eval.plugins.explanations import NAMED
 from oodd_live.reading import Reading
 
 BARS: Final = " ▁▂▃▄▅▆▇█"
@@ -77,9 +78,10 @@ class TerminalMonitor:
         past = "".join(_bar(share) for share in self._past)
         statistic = f"statistic {reading.statistic:.4g}, threshold {reading.threshold:.4g}"
         table = Table(box=None, show_header=False, padding=(0, 1))
-        for name, share in list(reading.sensors.items())[:SENSORS]:
-            bar = "█" * round(WIDTH * share)
-            table.add_row(name, f"{share:4.0%}", bar, reading.faults.get(name, ""))
+        for name in list(dict.fromkeys([*reading.parts, *reading.sensors]))[:SENSORS]:
+            share, p = reading.sensors.get(name, 0.0), reading.parts.get(name, 0.0)
+            fault = reading.faults.get(name) or f"at fault {p:.0%}" * (p >= NAMED)
+            table.add_row(name, f"{share:4.0%}", "█" * round(WIDTH * share), fault)
         picture = Group(Text(str(reading), style=style), Text(past), Text(statistic), table)
         return Panel(picture, title=self.title, border_style=style)
 

@@ -34,6 +34,7 @@ from oodd_eval.metrics.cusum import Standardization
 from oodd_eval.metrics.faults import ParetoTail, StreamScale, readings
 from oodd_eval.names import check_known, counted
 from oodd_eval.plugins.contract import AnyDetector, StorableDetector, copied
+from oodd_eval.plugins.explanations import Explanation, naming_of
 from oodd_eval.plugins.state import pack, read_state, take, write_state
 from oodd_eval.plugins.voices import VoiceCosts, costs_of_voices
 from oodd_live.handle import DetectorHandle, has_actions, streaming
@@ -104,6 +105,10 @@ class Watchdog:
         self.voices: VoiceCosts | None = None
         self._live = streaming(handle.detector)
         self._explain_last = getattr(self._live, "explain_last", None)
+        # Actuators that the detector sees: by number without names, or with those of sensors.
+        names = enumerate(nominal.actions or [""] * len(rest))
+        actuators = [n if n not in {"", *self.sensors} else f"actuator {j}" for j, n in names]
+        self._parts = [*self.sensors, *actuators] if handle.actions else self.sensors
         commands = rest if handle.actions else ()
         self._stream = Stream(stream, commands, settings.rate, nominal.baseline)
         # Rows at the start that are not judged, and rows that the detector is not shown.
@@ -424,7 +429,8 @@ class Watchdog:
             if alarmed:
                 first, *rest = group
                 last = rest[-1].t if rest else first.t
-                alarms.append(EpisodeAlarm(first.t, last, first.onset, first.sensors, first.faults))
+                blame = first.onset, first.sensors, first.faults, first.parts, first.kind
+                alarms.append(EpisodeAlarm(first.t, last, *blame))
         return alarms
 
     def _judged(
@@ -462,7 +468,8 @@ class Watchdog:
         if self.raised and not self.settings.latch and not new:
             self.raised, self._held = None, self.settings.hold_off
         alarm = bool(new or self.raised)
-        sensors, onset = self._blamed() if alarm else ({}, None)  # takes as long as a score
+        # It takes as long as a score.
+        sensors, onset, parts, kind = self._blamed() if alarm else ({}, None, {}, "")
         reading = Reading(
             self._t,
             math.nan if math.isnan(score) else score,
@@ -472,6 +479,8 @@ class Watchdog:
             sensors,
             onset,
             {self._name(d): fault for d, fault in self._faults.items()},
+            parts,
+            kind,
         )
         if new and not self.raised:
             self.raised = reading
@@ -484,20 +493,29 @@ class Watchdog:
         row = as_numbers(observation)
         return row - self._nominal.offsets if row.shape == self._nominal.offsets.shape else row
 
-    def _blamed(self) -> tuple[dict[str, float], int | None]:
-        """Return shares by sensor and the onset: from faults where there are any."""
+    def _blamed(self) -> tuple[dict[str, float], int | None, dict[str, float], str]:
+        """Return shares, onset, parts and kind: from faults where there are any."""
         # Those that raise an alarm before those that are only odd.
         faulty = [d for d in self._faults if isinstance(d, int)] or self._stream.suspects
         if faulty:
             onset = int(self._stream.since[faulty].min())
-            return {self._name(d): 1 / len(faulty) for d in faulty}, onset
+            names = [self._name(d) for d in faulty]
+            parts = dict.fromkeys(names, 1.0)
+            return dict.fromkeys(names, 1 / len(faulty)), onset, parts, "sensor"
         if OBSERVATION in self._faults or self._explain_last is None:
-            return {}, None
-        shares, onset, *_ = self._explain_last()
+            return {}, None, {}, ""
+        shares, onset, *naming = self._explain_last()
         if onset < 0:
-            return {}, None
+            return {}, None, {}, ""
+        explanation = Explanation(shares[None], np.array([onset]), *naming)
+        named = naming_of(explanation, len(self._parts) - len(self.sensors))
         order = np.argsort(-shares, kind="stable").tolist()
-        return {self.sensors[d]: float(shares[d]) for d in order}, int(onset) + self._hidden
+        sensors = {self.sensors[d]: float(shares[d]) for d in order}
+        values = np.concatenate([named.sensors, named.actuators]).tolist()
+        probabilities = sensors | dict(zip(self._parts, values, strict=True))
+        likely = sorted(probabilities.items(), key=lambda part: -part[1])
+        parts = {name: p for name, p in likely if p > 0}
+        return sensors, int(onset) + self._hidden, parts, named.kind
 
     def _name(self, number: int | str) -> str:
         return number if isinstance(number, str) else self.sensors[number]
@@ -543,6 +561,7 @@ class Watchdog:
         values = {
             "made": self._handle.state,
             "sensors": self.sensors,
+            "actions": self._nominal.actions,
             "threshold": self.rule.threshold,
             "standardization": scale and scale.numbers,
             "calibration": calibration
@@ -616,6 +635,7 @@ class Watchdog:
         ):
             raise FittedStateError(f"it does not fit {type(handle.detector).__name__}")
         nominal = Nominal.of(state, names, int(values["made"]["baseline"]))
+        nominal = replace(nominal, actions=tuple(map(str, values.get("actions", ()))))
         scale, calibration_values, length = (
             values[name] for name in ("standardization", "calibration", "run_length")
         )

@@ -16,7 +16,8 @@ TYPES = get_typestore(Stores.ROS2_HUMBLE).types
 
 def test_exact_shape():
     reading = replace(QUIET, alarm=True, statistic=3.5, sensors={"gyro x": 0.75, "gyro y": 0.25},
-                      onset=4, faults={"gyro x": "frozen"})  # fmt: skip
+                      onset=4, faults={"gyro x": "frozen"}, parts={"gyro x": 1.0, "fan": 0.25},
+                      kind="sensor")  # fmt: skip
     assert reading.diagnostics("arm watchdog", "arm-1", time=12.75) == {
         "header": {"stamp": {"sec": 12, "nanosec": 750_000_000}, "frame_id": ""},
         "status": [
@@ -32,6 +33,9 @@ def test_exact_shape():
                     {"key": "threshold", "value": "3.0"},
                     {"key": "alarm", "value": "true"},
                     {"key": "onset", "value": "4"},
+                    {"key": "kind", "value": "sensor"},
+                    {"key": "part gyro x", "value": "1.000"},
+                    {"key": "part fan", "value": "0.250"},
                     {"key": "sensor gyro x", "value": "0.750"},
                     {"key": "sensor gyro y", "value": "0.250"},
                     {"key": "fault gyro x", "value": "frozen"},

@@ -1,5 +1,6 @@
 """A watchdog beside a robot: its promise, its alarm, its memory, and what it keeps on disk."""
 
+import io
 import json
 import threading
 from dataclasses import replace
@@ -7,9 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers_live import first_alarm, rows_of, walk
-from oodd_live import Reading, Watchdog
+from oodd_live import Reading, TerminalMonitor, Watchdog
+from rich.console import Console
 
-from oodd_eval import Trajectory
+from oodd_eval import Naming, Trajectory, load_split
 from oodd_eval.errors import (
     ContractError,
     FittedStateError,
@@ -332,6 +334,69 @@ def test_a_detector_of_whole_episodes_explains_its_alarm():
     assert list(reading.sensors) == ["y", "z", "x"]
     assert reading.sensor == "y"
     assert str(reading) == "row 0: alarm, y 75%, since row 0"
+    assert (reading.parts, reading.kind) == ({"y": 1.0}, "")  # it carries half alone
+    reading = watchdog.update([48.0, 61.0, 21.0])
+    assert reading.parts == {"y": 1.0, "x": 1.0}
+    assert str(reading) == "row 1: alarm, y 47%, x 37%, since row 1"
+    calm = watchdog.copy().update([0.1, 0.2, 0.3])
+    assert (calm.alarm, calm.parts, calm.kind) == (False, {}, "")
+
+
+class NamesParts(LiveSize):
+    """Names a sensor and an actuator in every row."""
+
+    said = Naming(np.array([0.2, 0.9, 0.0]), np.array([0.7, 0.0]), np.ones(3), "actuator")
+
+    def explain_last(self):
+        return np.array([0.5, 0.3, 0.2]), self.rows - 1, self.said
+
+    def reset(self):
+        self.rows = 0
+
+    def update(self, observation, action=None):
+        self.rows += 1
+        return super().update(observation, action)
+
+
+def test_a_reading_names_sensors_and_actuators_and_the_kind():
+    rng = np.random.default_rng(0)
+    train, calibration = (
+        [Trajectory(x.observations, rng.normal(size=(x.transitions, 2))) for x in of]
+        for of in (TRAIN, CALIBRATION)
+    )
+    watchdog = Watchdog.fit(NamesParts(), train, calibration, statistic="score", sensors=NAMES)
+    watchdog.update([0.1, 0.2, 0.3])
+    reading = watchdog.update([0.0, 60.0, 20.0], [0.1, 0.2])
+    assert reading.alarm
+    assert list(reading.parts.items()) == [("y", 0.9), ("actuator 0", 0.7), ("x", 0.2)]
+    assert list(reading.sensors) == ["x", "y", "z"]
+    assert reading.kind == "actuator"
+    assert str(reading) == "row 1: alarm, actuator fault, y 30%, actuator 0, since row 1"
+    episode = Trajectory([[0.1, 0.2, 0.3], [0.0, 60.0, 20.0]], [[0.1, 0.2]])
+    (alarm,) = watchdog.explain(episode)
+    assert (alarm.parts, alarm.kind) == (reading.parts, reading.kind)
+    assert str(alarm) == str(reading).replace("row 1:", "rows 1 to 1:", 1)
+    console = Console(file=io.StringIO(), width=60)
+    monitor = TerminalMonitor("cart", console)
+    monitor.update(reading)
+    console.print(monitor.picture())
+    lines = console.file.getvalue().splitlines()
+    at_fault = [line.strip("│ ").split("%")[0] for line in lines if "at fault" in line]
+    assert [line.split(maxsplit=1)[0] for line in at_fault] == ["y", "actuator"]
+    assert [line.rpartition("at fault ")[2][:3] for line in lines if "at fault" in line] == [
+        "90%", "70%"
+    ]  # fmt: skip
+
+
+def test_actuators_have_the_names_of_a_split_also_after_loading(tmp_path):
+    with load_split("mini").opened() as opened:
+        data = opened("cartpole")
+        watchdog = Watchdog.fit("mewma-a", data)
+        names = [*watchdog.sensors, *(action.name for action in data.actions)]
+        assert watchdog._parts == names
+        watchdog.save(tmp_path / "cart.npz")
+        assert Watchdog.load(tmp_path / "cart.npz")._parts == names
+        assert Watchdog.fit("mahalanobis", data)._parts == watchdog.sensors
 
 
 class Explaining(LiveSize):
@@ -379,6 +444,7 @@ def test_an_explained_episode_names_faults_of_sensors(watchdog):
     rows[70:, 2] = rows[69, 2]
     (alarm,) = watchdog.explain(Trajectory(rows, x.actions))
     assert (alarm.faults, alarm.sensors, alarm.onset) == ({"z": "frozen"}, {"z": 1.0}, 70)
+    assert (alarm.parts, alarm.kind) == ({"z": 1.0}, "sensor")
     assert 70 < alarm.first < 100
     assert alarm.last == 119
     assert str(alarm) == f"rows {alarm.first} to 119: alarm, z frozen, since row 70"
