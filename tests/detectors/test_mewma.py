@@ -192,6 +192,39 @@ def test_a_constant_sensor_is_seen_and_actions_explain_what_observations_cannot(
         assert len({chart.score(shifted(x, 79, sign * by))[-1] for by in (1e3, 1e6)}) == 1
 
 
+@pytest.mark.parametrize("horizon", [1, 3])
+def test_shares_are_parts_of_the_largest_squared_length_and_stream(horizon):
+    detector = make_mewma_a(horizon=horizon).fit(NOMINAL)
+    x = shifted(episode(71), 40, 1.0)
+    shares, onsets, *_ = detector.explain(x)
+    first = horizon + 2  # a forecast needs three observations
+    assert np.isnan(shares[:horizon]).all()
+    assert (shares[horizon:first] == 1 / 4).all()
+    np.testing.assert_allclose(shares[horizon:].sum(axis=1), 1.0)
+    smoothed = detector._smoothed(x, detector.coefficients_)
+    t = 50
+    lengths = []
+    for i, root in enumerate(detector.whitening_):
+        precision = root @ root.T
+        z = smoothed[i, t - first]
+        length = np.sqrt(z @ precision @ z)
+        unusual = (length - detector.distance_mean_[i, 0]) / detector.distance_std_[i, 0]
+        lengths.append((unusual, z * (precision @ z)))
+    parts = np.maximum(max(lengths, key=lambda pair: pair[0])[1], 0.0)
+    np.testing.assert_allclose(shares[t], parts / parts.sum(), rtol=1e-9)
+
+    assert (onsets[:horizon] == -1).all()
+    assert onsets[horizon:first].tolist() == [*range(horizon, first)]
+    assert shares[45].argmax() == 0
+    assert abs(onsets[45] - 40) <= 2
+    detector.reset()
+    for t, row in enumerate(zip(x.observations, [None, *x.actions], strict=True)):
+        detector.update(*row)
+        share, onset, *_ = detector.explain_last()
+        np.testing.assert_allclose(share, shares[t], rtol=1e-9)
+        assert onset == onsets[t]
+
+
 def test_rows_without_actions_and_scales_of_zero_are_refused(chart_a):
     made = make_mewma_a()
     made.restore(chart_a.state())

@@ -447,7 +447,7 @@ def test_no_voice_costs_three_points_of_what_the_best_voice_alone_finds(tmp_path
 
 def test_ten_episodes_name_the_sensor_and_the_onset(panel):
     faulty = with_step(log_of(50), 200, 300, 3.0, sensor=5)
-    shares, onsets = panel.explain(faulty)
+    shares, onsets, *_ = panel.explain(faulty)
     assert np.isnan(shares[0]).all()
     assert onsets[0] == -1
     assert (shares[205:].argmax(axis=1) == 5).mean() > 0.8
@@ -483,6 +483,12 @@ def test_a_level_of_the_day_is_taken_out_with_baseline_rows():
     assert (scores[1:60] == 0).all()
     panel.reset()
     np.testing.assert_array_equal([panel.update(row) for row in test.observations], scores)
+    # A live episode counts its rows from the first one, too.
+    faulty = with_step(test, 120, 200, 2.0)
+    panel.reset()
+    for row in faulty.observations[:150]:
+        panel.update(row)
+    assert panel.explain_last()[1] == panel.explain(faulty).onsets[149] == pytest.approx(120, abs=5)
 
 
 def test_what_differs_between_episodes_is_learnt_from_their_first_rows():
@@ -575,7 +581,7 @@ def charting():
 def test_charts_of_constants_are_a_voice_that_streams_and_is_restored(charting):
     assert charting.voices_["charts"].rank
     faulty = pumped(301, 1.05, onset=120)
-    scores, (shares, onsets) = charting.score(faulty), charting.explain(faulty)
+    scores, (shares, onsets, *_) = charting.score(faulty), charting.explain(faulty)
     said = charting.voices(faulty)["charts"][1:]
     assert said[150:].min() > said[:110].max()
     restored = make_panel("panel-a", forecast="linear")
@@ -586,7 +592,7 @@ def test_charts_of_constants_are_a_voice_that_streams_and_is_restored(charting):
     actions = [None, *faulty.actions]
     for t, (row, action) in enumerate(zip(faulty.observations, actions, strict=True)):
         np.testing.assert_array_equal(restored.update(row, action), scores[t])
-        share, onset = restored.explain_last()
+        share, onset, *_ = restored.explain_last()
         np.testing.assert_array_equal(share, shares[t])
         assert onset == onsets[t]
 
@@ -616,7 +622,7 @@ def test_more_sensors_than_components_are_forecast_by_components():
     panel = make_panel().fit([wide(seed) for seed in range(6)])
     assert panel.forecast_.coefficients.shape == (3 * 64 + 1, 64)
     faulty = with_step(wide(50), 40, 80, 5.0, sensor=77)
-    shares, _ = panel.explain(faulty)
+    shares, *_ = panel.explain(faulty)
     assert (shares[45:].argmax(axis=1) == 77).mean() > 0.8
 
 

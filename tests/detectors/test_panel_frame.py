@@ -99,7 +99,7 @@ def test_a_thruster_that_is_not_as_it_was_is_found(panel, fault):
 
 def test_the_score_streams_and_is_restored(panel):
     faulty = body(200, onset=60, side=2.0)
-    scores, (shares, onsets) = panel.score(faulty), panel.explain(faulty)
+    scores, (shares, onsets, *_) = panel.score(faulty), panel.explain(faulty)
     prefix = panel.voices(Trajectory(faulty.observations[:90]))["frame"]
     np.testing.assert_array_equal(prefix, panel.voices(faulty)["frame"][:90])
     restored = make_panel(forecast="linear", roles=ROLES)
@@ -110,7 +110,7 @@ def test_the_score_streams_and_is_restored(panel):
     for t, row in enumerate(faulty.observations):
         assert restored.update(row) == pytest.approx(scores[t], rel=1e-12, nan_ok=True)
         if t:
-            share, onset = restored.explain_last()
+            share, onset, *_ = restored.explain_last()
             np.testing.assert_allclose(share, shares[t], atol=1e-9)
             assert onset == onsets[t]
     voice.reset()

@@ -101,3 +101,50 @@ def product(rows: Floats, matrix: Floats, block: int = BLOCK) -> Floats:
     filled[:n] = rows
     multiplied: Floats = np.matmul(filled.reshape(count, block, k), matrix)
     return multiplied.reshape(count * block, m)[:n]
+
+
+class Onset:
+    """The row with which an anomaly would have begun: where a CUSUM of scores last left zero.
+
+    Parameters
+    ----------
+    reference
+        Score that a row must exceed to count as anomalous.
+    first
+        Number of the first row that has a score.
+
+    Notes
+    -----
+    Source: Page, "Continuous inspection schemes", Biometrika 41 (1954).
+
+    Examples
+    --------
+    >>> onset = Onset(reference=2.0, first=1)
+    >>> [onset(score) for score in (0.0, 5.0, 1.0, 3.0, 0.0)]
+    [1, 2, 2, 2, 2]
+    """
+
+    def __init__(self, reference: float, first: int) -> None:
+        self._reference, self._sum, self._now, self._onset = reference, 0.0, first, first
+
+    def __call__(self, score: float) -> int:
+        """Return the onset as seen at the next row, of this score."""
+        if self._sum <= 0:
+            self._onset = self._now
+        self._sum = max(0.0, self._sum + score - self._reference)
+        self._now += 1
+        return self._onset
+
+
+def shares_of(parts: Floats) -> Floats:
+    """Return shares of the sum of each row, (N, D), equal ones where the sum is 0.
+
+    From contributions that are not negative.
+
+    Examples
+    --------
+    >>> shares_of(np.array([[3.0, 1.0], [0.0, 0.0]])).tolist()
+    [[0.75, 0.25], [0.5, 0.5]]
+    """
+    total = parts.sum(axis=1, keepdims=True)
+    return np.where(total > 0, parts / np.where(total > 0, total, 1.0), 1.0 / parts.shape[1])

@@ -13,10 +13,19 @@ from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from oodd_common.charts import Floats, Smoother, distance, product, smooth, whitening
+from oodd_common.charts import (
+    Floats,
+    Onset,
+    Smoother,
+    distance,
+    product,
+    shares_of,
+    smooth,
+    whitening,
+)
 from oodd_common.windows import StorableWindowDetector
 
-from oodd_eval import Trajectory
+from oodd_eval import Explanation, Trajectory
 from oodd_eval.errors import TrajectoryError
 from oodd_eval.plugins.forecasting import CONSTANT, FeatureScale
 from oodd_eval.plugins.state import Arrays, take
@@ -25,6 +34,8 @@ from oodd_mewma.forecast import Moments, regressors
 
 FOLDS: Final = 5
 """Parts of the nominal trajectories, each judged by what was learnt from the others."""
+REFERENCE: Final = 1.5
+"""Score that a row must exceed to count as anomalous in the estimate of the onset."""
 
 
 class MewmaDetector(StorableWindowDetector):
@@ -81,21 +92,44 @@ class MewmaDetector(StorableWindowDetector):
         scores = np.full(len(trajectory), np.nan)
         scores[self.horizon :] = 0.0
         if trajectory.transitions >= self._first:
-            scores[self._first :] = self._standardized(
-                self._smoothed(trajectory, self.coefficients_)
-            )
+            smoothed = self._smoothed(trajectory, self.coefficients_)
+            scores[self._first :] = self._standardized(smoothed).max(axis=0)
         return scores
+
+    def explain(self, trajectory: Trajectory) -> Explanation:
+        """Return the sensors that the most unusual sum points at, and since when.
+
+        A sensor's share is its part of the square of that sum's Mahalanobis length. The onset is
+        where a CUSUM of the scores last left zero (Page 1954).
+        """
+        scores, h = self.score(trajectory), self.horizon
+        shares = np.full(trajectory.observations.shape, np.nan)
+        shares[h:] = 1.0 / trajectory.observation_dim
+        if trajectory.transitions >= self._first:
+            shares[self._first :] = self._shares(self._smoothed(trajectory, self.coefficients_))
+        onset, onsets = Onset(REFERENCE, h), np.full(len(trajectory), -1)
+        onsets[h:] = [onset(score) for score in scores[h:].tolist()]
+        return Explanation(shares, onsets)
 
     def reset(self) -> None:
         """Begin a new live episode."""
         super().reset()
         self._smoother: Smoother | None = None
+        self._onset, self._since = Onset(REFERENCE, self.horizon), -1
+
+    def explain_last(self) -> tuple[Floats, int]:
+        """Return the row of `explain` for the latest `update`: shares (sensors,), and the onset."""
+        if self._smoother is not None:
+            return self._shares(self._sums)[0], self._since
+        sensors = len(self._scale().mean)
+        return np.full(sensors, np.nan if self._since < 0 else 1.0 / sensors), self._since
 
     def _row(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         return self._scale().checked(observation)
 
     def _judge(self, window: NDArray[np.float32], now: NDArray[np.float32], t: int) -> float:
         if t < self._first:
+            self._since = self._onset(0.0)
             return 0.0
         known = [_standard(window, self.observation_scale_).ravel()]
         if self.actions:
@@ -104,7 +138,10 @@ class MewmaDetector(StorableWindowDetector):
         x = np.concatenate([*known, np.ones(1)])[None]
         residual = _standard(now[None], self.observation_scale_) - product(x, self.coefficients_)
         self._smoother = self._smoother or Smoother(self.parameters.weights, len(now))
-        return float(self._standardized(self._smoother(self._clipped(residual)))[0])
+        self._sums = self._smoother(self._clipped(residual))
+        score = float(self._standardized(self._sums).max(axis=0)[0])
+        self._since = self._onset(score)
+        return score
 
     def _learn(self, nominal: Sequence[Trajectory]) -> FeatureScale:
         usable = [x for x in nominal if x.transitions >= self._first]
@@ -180,10 +217,21 @@ class MewmaDetector(StorableWindowDetector):
         return smooth(self._clipped(self._residuals(x, coefficients)), self.parameters.weights)
 
     def _standardized(self, smoothed: Floats) -> Floats:
-        """Return the largest standardized distance of every step: (W, N, D) to (N,)."""
+        """Return the standardized distances of sums: (W, N, D) to (W, N)."""
         distances = _distances(smoothed, self.whitening_)
         standardized: Floats = (distances - self.distance_mean_) / self.distance_std_
-        return np.asarray(standardized.max(axis=0))
+        return standardized
+
+    def _shares(self, smoothed: Floats) -> Floats:
+        """Return the sensors' shares in the largest distance: (W, N, D) to (N, D)."""
+        loudest = self._standardized(smoothed).argmax(axis=0)
+        parts = np.stack(
+            [
+                z * product(product(z, root), root.T)
+                for z, root in zip(smoothed, self.whitening_, strict=True)
+            ]
+        )
+        return shares_of(np.maximum(parts[loudest, np.arange(len(loudest))], 0.0))
 
     def _whitening(self, covariances: Floats) -> Floats:
         return np.stack([whitening(c, self.parameters.shrinkage) for c in covariances])

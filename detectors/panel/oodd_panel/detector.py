@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from oodd_common.charts import Floats, limited, product
+from oodd_common.charts import Floats, Onset, limited, product, shares_of
 from oodd_common.windows import LongFitDetector, StandardEpisode, regressors
 
 from oodd_eval import Explanation, Trajectory
@@ -143,7 +143,7 @@ class PanelDetector(LongFitDetector):
             for k, voice in enumerate(self.voices_.values(), 1):
                 if (speaks := loudest == k).any():
                     shares[h:][speaks] = voice.shares(visible)[speaks]
-            onset = _Onset(h)
+            onset = Onset(REFERENCE, h)
             onsets[h:] = [onset(score) for score in said.max(axis=0).tolist()]
         return Explanation(shares, onsets)
 
@@ -154,7 +154,7 @@ class PanelDetector(LongFitDetector):
         self._shift: Shift | None = None
         self._latest: Latest | None = None
         self._learner: EpisodeLearner | None = None
-        self._onset = _Onset(self.horizon)
+        self._onset = Onset(REFERENCE, self.horizon)
         self._last: tuple[Features, Floats, int, int] | None = None
         self._action: NDArray[np.float32] | None = None
         for voice in getattr(self, "voices_", {}).values():
@@ -176,7 +176,7 @@ class PanelDetector(LongFitDetector):
             for first, command in self._first:
                 self._action = command
                 super().update(first, command)
-            self._onset = _Onset(self.horizon, t + 1)
+            self._onset = Onset(REFERENCE, t + 1)
         return float("nan") if t < self.horizon else 0.0
 
     def explain_last(self) -> tuple[Floats, int]:
@@ -327,10 +327,7 @@ class PanelDetector(LongFitDetector):
                 continue
             seen = member.features(features)[rows]
             parts = np.maximum(member.differences(seen)[1], 0.0)
-            by_sensor = parts.reshape(len(parts), -1, sensors).sum(axis=1)
-            total = by_sensor.sum(axis=1, keepdims=True)
-            even = np.full_like(by_sensor, 1 / sensors)
-            shares[rows] = np.where(total > 0, by_sensor / np.where(total > 0, total, 1.0), even)
+            shares[rows] = shares_of(parts.reshape(len(parts), -1, sensors).sum(axis=1))
         return shares
 
     # Fit.
@@ -557,21 +554,6 @@ def _combined(surprises: Floats) -> Floats:
     """Return root mean squares over members, (N, K) to (N,): one that is certain outweighs four."""
     combined: Floats = np.sqrt((surprises * surprises).mean(axis=1))
     return combined
-
-
-class _Onset:
-    """The row with which an anomaly would have begun: where a CUSUM of scores last left zero."""
-
-    def __init__(self, first: int, nominal: int = 0) -> None:
-        self._sum, self._now, self._onset, self._nominal = 0.0, first, first, nominal
-
-    def __call__(self, score: float) -> int:
-        """Return the onset as seen at the next row."""
-        if self._sum <= 0:
-            self._onset = self._now
-        self._sum = max(0.0, self._sum + score - REFERENCE)
-        self._now += 1
-        return self._onset
 
 
 def _basis(rows: Sequence[Floats]) -> Floats:
