@@ -167,9 +167,9 @@ class WindowDetector(ABC):
         return self.scale_
 
     def _command(self, action: Row | None) -> Row:
-        """Return an action as it is, (A,)."""
+        """Return a copy of an action as it is, (A,): loops may write the next one into theirs."""
         width = len(self.action_scale_.mean)
-        command = np.asarray(np.nan if action is None else action, dtype=np.float32)
+        command = np.array(np.nan if action is None else action, dtype=np.float32)
         if command.shape != (width,) or not np.isfinite(command).all():
             raise TrajectoryError(
                 f"detector {self.name!r} was given an action {action}, expected {width} finite "

@@ -23,9 +23,10 @@ from oodd_common.charts import (
     smooth,
     whitening,
 )
+from oodd_common.latest_rows import LatestRowsNamer
 from oodd_common.windows import StorableWindowDetector
 
-from oodd_eval import Explanation, Trajectory
+from oodd_eval import Explanation, Naming, Trajectory
 from oodd_eval.errors import TrajectoryError
 from oodd_eval.plugins.forecasting import CONSTANT, FeatureScale
 from oodd_eval.plugins.state import Arrays, take
@@ -77,11 +78,12 @@ class MewmaDetector(StorableWindowDetector):
     control chart", Technometrics 34 (1992).
     """
 
-    kind: ClassVar[str] = "mewma/4"
+    kind: ClassVar[str] = "mewma/5"
 
     def __init__(
         self, name: str, parameters: MewmaParameters, *, seed: int, horizon: int, actions: bool
     ) -> None:
+        self._namer = LatestRowsNamer(None)
         super().__init__(name, seed=seed, horizon=horizon, window=parameters.order, actions=actions)
         self.parameters = parameters
         self._first = horizon + parameters.order - 1  # first time that has all its regressors
@@ -100,7 +102,8 @@ class MewmaDetector(StorableWindowDetector):
         """Return the sensors that the most unusual sum points at, and since when.
 
         A sensor's share is its part of the square of that sum's Mahalanobis length. The onset is
-        where a CUSUM of the scores last left zero (Page 1954).
+        where a CUSUM of the scores last left zero (Page 1954). Parts at fault are named of at most
+        64 sensors, see `oodd_common.naming`.
         """
         scores, h = self.score(trajectory), self.horizon
         shares = np.full(trajectory.observations.shape, np.nan)
@@ -109,20 +112,31 @@ class MewmaDetector(StorableWindowDetector):
             shares[self._first :] = self._shares(self._smoothed(trajectory, self.coefficients_))
         onset, onsets = Onset(REFERENCE, h), np.full(len(trajectory), -1)
         onsets[h:] = [onset(score) for score in scores[h:].tolist()]
-        return Explanation(shares, onsets)
+        return Explanation(shares, onsets, self._namer(trajectory) if len(trajectory) > h else None)
 
     def reset(self) -> None:
         """Begin a new live episode."""
         super().reset()
         self._smoother: Smoother | None = None
         self._onset, self._since = Onset(REFERENCE, self.horizon), -1
+        self._namer.reset()
 
-    def explain_last(self) -> tuple[Floats, int]:
-        """Return the row of `explain` for the latest `update`: shares (sensors,), and the onset."""
-        if self._smoother is not None:
-            return self._shares(self._sums)[0], self._since
+    def update(
+        self, observation: NDArray[np.float32], action: NDArray[np.float32] | None = None
+    ) -> float:
+        """Return the score of the next observation of a live episode, NaN for t < horizon."""
+        score = super().update(observation, action)
+        self._namer.update(self._rows[0], self._commands[0] if self._commands else None)
+        return score
+
+    def explain_last(self) -> tuple[Floats, int, Naming | None]:
+        """Return what `explain` says of the latest `update`: shares (sensors,), onset, naming."""
         sensors = len(self._scale().mean)
-        return np.full(sensors, np.nan if self._since < 0 else 1.0 / sensors), self._since
+        if self._since < 0:
+            return np.full(sensors, np.nan), -1, None
+        few = self._smoother is None
+        shares = np.full(sensors, 1.0 / sensors) if few else self._shares(self._sums)[0]
+        return shares, self._since, self._namer.last()
 
     def _row(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         return self._scale().checked(observation)
@@ -156,6 +170,7 @@ class MewmaDetector(StorableWindowDetector):
         self.observation_scale_ = _scale_of([x.observations for x in usable])
         known = usable if self.actions else [x.without_actions() for x in usable]
         self.action_scale_ = _scale_of([x.actions for x in known])
+        self._namer = LatestRowsNamer.fit(known)
         folds = [usable[i :: min(FOLDS, len(usable))] for i in range(min(FOLDS, len(usable)))]
 
         ridge = self.parameters.ridge
@@ -255,6 +270,7 @@ class MewmaDetector(StorableWindowDetector):
             "whitening": self.whitening_.swapaxes(1, 2),
             "distance_mean": self.distance_mean_,
             "distance_std": self.distance_std_,
+            **self._namer.arrays(),
         }
 
     def _restore(self, arrays: Arrays, sensors: int) -> None:
@@ -269,6 +285,7 @@ class MewmaDetector(StorableWindowDetector):
         self.whitening_ = take(arrays, "whitening", (w, d, d)).swapaxes(1, 2)
         self.distance_mean_ = take(arrays, "distance_mean", (w, 1))
         self.distance_std_ = take(arrays, "distance_std", (w, 1), "+")
+        self._namer = LatestRowsNamer.of(arrays)
 
 
 def _scale_of(arrays: Sequence[NDArray[np.float32]]) -> FeatureScale:

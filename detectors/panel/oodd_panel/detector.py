@@ -15,9 +15,10 @@ from typing import Any, ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 from oodd_common.charts import Floats, Onset, limited, product, shares_of
+from oodd_common.latest_rows import LatestRowsNamer
 from oodd_common.windows import LongFitDetector, StandardEpisode, regressors
 
-from oodd_eval import Explanation, Trajectory
+from oodd_eval import Explanation, Naming, Trajectory
 from oodd_eval.data.baseline import Baseline, Shift
 from oodd_eval.errors import TrajectoryError
 from oodd_eval.plugins.forecasting import CONSTANT, FeatureScale
@@ -87,7 +88,7 @@ class PanelDetector(LongFitDetector):
     `oodd_panel.members`.
     """
 
-    kind: ClassVar[str] = "panel/3"
+    kind: ClassVar[str] = "panel/4"
 
     def __init__(
         self,
@@ -101,6 +102,7 @@ class PanelDetector(LongFitDetector):
         roles: Sequence[str] = (),
     ) -> None:
         self.baseline, self.roles = baseline, tuple(roles)
+        self._namer = LatestRowsNamer(None)
         super().__init__(name, seed=seed, horizon=horizon, window=LAGS, actions=actions)
         self.parameters = parameters
         self.members_: list[PanelMember] = [member() for member in MEMBERS]
@@ -127,7 +129,8 @@ class PanelDetector(LongFitDetector):
         """Return the sensors that the most surprised voice points at, and since when.
 
         A sensor's share is its part of the square of that member's distance, or what the ensemble
-        explains. The onset is where a CUSUM of the scores last left zero (Page 1954).
+        explains. The onset is where a CUSUM of the scores last left zero (Page 1954). Parts at
+        fault are named of at most 64 sensors, see `oodd_common.naming`.
         """
         self._must_fit(trajectory)
         visible = self._visible(trajectory)
@@ -145,7 +148,8 @@ class PanelDetector(LongFitDetector):
                     shares[h:][speaks] = voice.shares(visible)[speaks]
             onset = Onset(REFERENCE, h)
             onsets[h:] = [onset(score) for score in said.max(axis=0).tolist()]
-        return Explanation(shares, onsets)
+        naming = None if judged is None else self._namer(visible, self.baseline)
+        return Explanation(shares, onsets, _in_units(naming, self._shift_of(trajectory)))
 
     def reset(self) -> None:
         """Begin a new live episode."""
@@ -157,6 +161,7 @@ class PanelDetector(LongFitDetector):
         self._onset = Onset(REFERENCE, self.horizon)
         self._last: tuple[Features, Floats, int, int] | None = None
         self._action: NDArray[np.float32] | None = None
+        self._namer.reset()
         for voice in getattr(self, "voices_", {}).values():
             voice.reset()
 
@@ -164,29 +169,39 @@ class PanelDetector(LongFitDetector):
         self, observation: NDArray[np.float32], action: NDArray[np.float32] | None = None
     ) -> float:
         """Return the score of the next observation of a live episode, NaN for t < horizon."""
+        command = None
+        if self.actions and action is not None:  # a copy: loops may write the next one into theirs
+            command = np.array(action, dtype=np.float32)
         if not self.baseline or self._shift is not None:
-            self._action = action
-            return super().update(observation, action)
+            return self._next(observation, command)
         row = self._scale().checked(observation)
         t = len(self._first)
-        self._first.append((row, action))
+        self._first.append((row, command))
         if t + 1 == self.baseline:
             rows = np.stack([first for first, _ in self._first])
             self._shift = self.baseline_.shift(rows)
-            for first, command in self._first:
-                self._action = command
-                super().update(first, command)
+            for pair in self._first:
+                self._next(*pair)
             self._onset = Onset(REFERENCE, t + 1)
         return float("nan") if t < self.horizon else 0.0
 
-    def explain_last(self) -> tuple[Floats, int]:
-        """Return the row of `explain` for the latest `update`: shares (sensors,), and the onset."""
+    def _next(self, observation: NDArray[np.float32], action: NDArray[np.float32] | None) -> float:
+        """Return the score of a row, of which the shift of its episode is known."""
+        self._action = action
+        score = super().update(observation, action)
+        self._namer.update(self._shifted, self._action)
+        return score
+
+    def explain_last(self) -> tuple[Floats, int, Naming | None]:
+        """Return what `explain` says of the latest `update`: shares (sensors,), onset, naming."""
         if self._last is None:
-            return np.full(len(self._scale().mean), np.nan), -1
+            return np.full(len(self._scale().mean), np.nan), -1, None
         features, surprises, loudest, onset = self._last
         if loudest:
-            return [*self.voices_.values()][loudest - 1].shares_last(), onset
-        return self._shares(features, surprises)[0], onset
+            shares = [*self.voices_.values()][loudest - 1].shares_last()
+        else:
+            shares = self._shares(features, surprises)[0]
+        return shares, onset, _in_units(self._namer.last(self.baseline), self._shift)
 
     # From rows to features.
 
@@ -223,10 +238,14 @@ class PanelDetector(LongFitDetector):
 
     def _visible(self, x: Trajectory) -> Trajectory:
         """Return a trajectory at training's level, as far as its first rows say where it is."""
+        shift = self._shift_of(x)
+        return x if shift is None else Trajectory(shift(x.observations), x.actions)
+
+    def _shift_of(self, x: Trajectory) -> Shift | None:
+        """Return what brings a trajectory to training's level, where its first rows tell it."""
         if not self.baseline or len(x) < self.baseline:
-            return x
-        shift = self.baseline_.shift(x.observations[: self.baseline])
-        return Trajectory(shift(x.observations), x.actions)
+            return None
+        return self.baseline_.shift(x.observations[: self.baseline])
 
     def standardized(self, x: Trajectory) -> StandardEpisode:
         """Return the rows that forecasts are of, of a trajectory at training's level."""
@@ -351,6 +370,9 @@ class PanelDetector(LongFitDetector):
             spread = np.where(spread < CONSTANT, 1.0, spread)
             self.action_scale_ = FeatureScale(commands.mean(axis=0), spread)
         visible = [self._visible(x) for x in usable]
+        self._namer = LatestRowsNamer.fit(
+            visible if self.actions else [x.without_actions() for x in visible]
+        )
         rows = [self._standard(x.observations) for x in visible]
         self.basis_ = _basis(rows) if len(scale.mean) > DIMENSIONS else np.empty((0, 0))
         episodes = [self._of_rows(r, x) for r, x in zip(rows, visible, strict=True)]
@@ -485,6 +507,7 @@ class PanelDetector(LongFitDetector):
             "error_scale": self.forecast_.scale,
             "prior": self.forecast_.prior,
             "basis": self.basis_,
+            **self._namer.arrays(),
         }
         if self.actions:
             arrays["action_scale"] = np.stack([self.action_scale_.mean, self.action_scale_.std])
@@ -514,6 +537,7 @@ class PanelDetector(LongFitDetector):
             take(arrays, "error_scale", (d,), "+"),
             take(arrays, "prior", (None, None)),
         )
+        self._namer = LatestRowsNamer.of(arrays)
         self.members_ = [member() for member in MEMBERS]
         for member, tail in zip(self.members_, self.tails_, strict=True):
             for holder in (member, tail):
@@ -554,6 +578,13 @@ def _combined(surprises: Floats) -> Floats:
     """Return root mean squares over members, (N, K) to (N,): one that is certain outweighs four."""
     combined: Floats = np.sqrt((surprises * surprises).mean(axis=1))
     return combined
+
+
+def _in_units(naming: Naming | None, shift: Shift | None) -> Naming | None:
+    """Return a naming of an episode at training's level with sizes in the sensors' own units."""
+    if naming is None or shift is None:
+        return naming
+    return naming._replace(sizes=naming.sizes / shift.factor)
 
 
 def _basis(rows: Sequence[Floats]) -> Floats:

@@ -143,9 +143,6 @@ class ProbabilisticEnsemble(LongFitDetector):
     def _row(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         return self._scale().checked(observation)
 
-    def _command(self, action: NDArray[np.float32] | None) -> NDArray[np.float32]:
-        return super()._command(action).copy()
-
     def _judge(self, window: NDArray[np.float32], now: NDArray[np.float32], t: int) -> float:
         if self._judging is None:
             self._judging = self.forecaster.begin(), _Sums(self), Onsets(self.charts_)
