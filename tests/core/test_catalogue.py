@@ -122,4 +122,8 @@ def test_columns_of_interventions_are_no_metrics_of_records():
         assert info.null in ("", *INTERVENTIONS)
     better = {name: info.better for name, info in INTERVENTIONS.items()}
     assert [n for n, side in better.items() if side == "higher"] == ["return_saved", "safety_gain"]
-    assert [n for n, side in better.items() if not side] == ["placebo_saved", "forced_harm", "acted"]
+    assert [n for n, side in better.items() if not side] == [
+        "placebo_saved",
+        "forced_harm",
+        "acted",
+    ]

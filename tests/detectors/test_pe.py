@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 import torch
 from helpers_state import assert_zero_scales_are_refused
+from oodd_common.charts import Onset
 from oodd_pe import make_pe
+from oodd_pe.detector import REFERENCE
 from oodd_pe.ensemble import BLOCK, DensityEnsemble
 from oodd_pe.forecaster import Transitions
 from oodd_pe.network import LEAST_SCALES, DensityNetworks, rounds, train
 from oodd_pe.rare import COUNTS, LARGEST, STEEP, Leaks, RareEvents, Regions, Tails
 from oodd_pe.rare import NOMINAL as NOMINAL_SUM
-from oodd_pe.statistic import RETURN, Charts, Evidence, Onsets, Running, deviance
+from oodd_pe.statistic import RETURN, Charts, Evidence, Running, deviance
 from scipy import stats
 from scipy.signal import lfilter
 from sklearn.tree import DecisionTreeRegressor
@@ -319,9 +321,9 @@ def test_sums_come_down_when_a_fault_has_ended(size):
 def test_onsets_by_hand(charts):
     r = np.zeros((30, 2))
     r[20:] = 6.0
-    columns, onsets = charts.columns(evidence(30, residuals=r)), Onsets(charts)
-    np.testing.assert_array_equal(onsets(columns[:20]), np.arange(20))
-    np.testing.assert_array_equal(onsets(columns[20:]), 20)
+    energies = charts.columns(evidence(30, residuals=r))[:, -1]
+    onset = Onset(REFERENCE * float(charts.spread_), 0)
+    assert [*map(onset, energies.tolist())] == [*range(20), *[20] * 10]
 
 
 # Rare events

@@ -106,10 +106,10 @@ class MewmaDetector(StorableWindowDetector):
         64 sensors, see `oodd_common.naming`.
         """
         scores, h = self.score(trajectory), self.horizon
-        shares = np.full(trajectory.observations.shape, np.nan)
-        shares[h:] = 1.0 / trajectory.observation_dim
-        if trajectory.transitions >= self._first:
-            shares[self._first :] = self._shares(self._smoothed(trajectory, self.coefficients_))
+        sums = np.zeros((len(self.parameters.weights), *trajectory.observations.shape))
+        sums[:, self._first :] = self._smoothed(trajectory, self.coefficients_)
+        shares = self._shares(sums)
+        shares[:h] = np.nan
         onset, onsets = Onset(REFERENCE, h), np.full(len(trajectory), -1)
         onsets[h:] = [onset(score) for score in scores[h:].tolist()]
         return Explanation(shares, onsets, self._namer(trajectory) if len(trajectory) > h else None)
@@ -131,12 +131,9 @@ class MewmaDetector(StorableWindowDetector):
 
     def explain_last(self) -> tuple[Floats, int, Naming | None]:
         """Return what `explain` says of the latest `update`: shares (sensors,), onset, naming."""
-        sensors = len(self._scale().mean)
         if self._since < 0:
-            return np.full(sensors, np.nan), -1, None
-        few = self._smoother is None
-        shares = np.full(sensors, 1.0 / sensors) if few else self._shares(self._sums)[0]
-        return shares, self._since, self._namer.last()
+            return np.full(len(self._scale().mean), np.nan), -1, None
+        return self._shares(self._sums)[0], self._since, self._namer.last()
 
     def _row(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         return self._scale().checked(observation)
@@ -144,6 +141,7 @@ class MewmaDetector(StorableWindowDetector):
     def _judge(self, window: NDArray[np.float32], now: NDArray[np.float32], t: int) -> float:
         if t < self._first:
             self._since = self._onset(0.0)
+            self._sums = np.zeros((len(self.parameters.weights), 1, len(now)))
             return 0.0
         known = [_standard(window, self.observation_scale_).ravel()]
         if self.actions:
@@ -240,12 +238,8 @@ class MewmaDetector(StorableWindowDetector):
     def _shares(self, smoothed: Floats) -> Floats:
         """Return the sensors' shares in the largest distance: (W, N, D) to (N, D)."""
         loudest = self._standardized(smoothed).argmax(axis=0)
-        parts = np.stack(
-            [
-                z * product(product(z, root), root.T)
-                for z, root in zip(smoothed, self.whitening_, strict=True)
-            ]
-        )
+        precisions = self.whitening_ @ self.whitening_.swapaxes(1, 2)
+        parts = smoothed * np.stack([*map(product, smoothed, precisions)])
         return shares_of(np.maximum(parts[loudest, np.arange(len(loudest))], 0.0))
 
     def _whitening(self, covariances: Floats) -> Floats:

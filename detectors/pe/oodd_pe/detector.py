@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from oodd_common.charts import Floats
+from oodd_common.charts import Floats, Onset
 from oodd_common.windows import LongFitDetector, windows
 from oodd_torch.device import resolved_device
 
@@ -23,13 +23,16 @@ from oodd_pe import PeParameters
 from oodd_pe.choice import ChosenForecaster
 from oodd_pe.forecaster import Assessment, Judge, Known, Transitions, Units
 from oodd_pe.rare import RareEvents
-from oodd_pe.statistic import Charts, Evidence, Onsets, Running
+from oodd_pe.statistic import Charts, Evidence, Running
 
 CHARTED: Final = 65_536
 """Steps from which charts are learnt, but for the rest of an episode: bounds time and memory."""
 
 TIMES: Final = 100
 """Steps from the beginning of an episode that are told apart where rare events are looked up."""
+
+REFERENCE: Final = 2.0
+"""Nominal standard deviations of the energy that a step must exceed to count as anomalous."""
 
 FOLDS: Final = 3
 """Parts of few nominal episodes; what judges one of them has learnt from the others."""
@@ -111,9 +114,9 @@ class ProbabilisticEnsemble(LongFitDetector):
     def explain(self, trajectory: Trajectory) -> Explanation:
         """Return which sensors the evidence of each row points at, and since when.
 
-        See `oodd_pe.statistic.Onsets`. A sensor's share is its part of what errors of single
-        sensors would explain of the step at the onset alone: later forecasts start from corrupted
-        readings, and every sensor disagrees with them.
+        The onset is where a CUSUM of the energy last left zero (Page 1954). A sensor's share is its
+        part of what errors of single sensors would explain of the step at the onset alone: later
+        forecasts start from corrupted readings, and every sensor disagrees with them.
         """
         self._must_fit(trajectory)
         shares = np.full(trajectory.observations.shape, np.nan)
@@ -121,16 +124,20 @@ class ProbabilisticEnsemble(LongFitDetector):
         if trajectory.transitions >= self.horizon:
             steps = self._transitions(trajectory)
             judged = self.forecaster.begin()(steps)
-            first_rows = Onsets(self.charts_)(self.charts_.columns(self._evidence(steps, judged)))
+            energies = self.charts_.columns(self._evidence(steps, judged))[:, -1].tolist()
+            first_rows = [*map(self._new_onset(), energies)]
             rows, of_row = np.unique(first_rows, return_inverse=True)
             shares[self.horizon :] = self._shares(steps.rows(rows), judged.rows(rows))[of_row]
-            onsets[self.horizon :] = first_rows + self.horizon
+            onsets[self.horizon :] = rows[of_row] + self.horizon
         return Explanation(shares, onsets)
+
+    def _new_onset(self) -> Onset:
+        return Onset(REFERENCE * float(self.charts_.spread_), 0)
 
     def reset(self) -> None:
         """Begin a new live episode."""
         super().reset()
-        self._judging: tuple[Judge, _Sums, Onsets] | None = None
+        self._judging: tuple[Judge, _Sums, Onset] | None = None
         self._onset = -1
         self._suspect: tuple[Transitions, Assessment] | None = None
 
@@ -145,8 +152,8 @@ class ProbabilisticEnsemble(LongFitDetector):
 
     def _judge(self, window: NDArray[np.float32], now: NDArray[np.float32], t: int) -> float:
         if self._judging is None:
-            self._judging = self.forecaster.begin(), _Sums(self), Onsets(self.charts_)
-        judge, sums, onsets = self._judging
+            self._judging = self.forecaster.begin(), _Sums(self), self._new_onset()
+        judge, sums, onset = self._judging
         actions = None
         if self.actions:
             commands = list(self._commands)[self.lag - 1 :]
@@ -157,7 +164,7 @@ class ProbabilisticEnsemble(LongFitDetector):
         judged = judge(steps)
         evidence = self._evidence(steps, judged)
         columns = self.charts_.columns(evidence)
-        self._onset = int(onsets(columns)[0]) + self.horizon
+        self._onset = onset(float(columns[0, -1])) + self.horizon
         if self._onset == t:
             self._suspect = steps, judged
         return float(sums(steps, evidence, columns)[0])

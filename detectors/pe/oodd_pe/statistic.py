@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from oodd_common.charts import Floats, Smoother, whitening
 
 from oodd_eval.plugins.forecasting import CONSTANT
@@ -29,8 +28,6 @@ ENERGY: Final = 25.0
 """Limit of a squared residual in the mean over sensors, which tells of zero-mean noise."""
 MOVEMENT: Final = 0.7
 """Share of the median movement; where sensors move less, a step counts less in the sums."""
-REFERENCE: Final = 2.0
-"""Nominal standard deviations of the energy that a step must exceed to count as anomalous."""
 RETURN: Final = 60
 """Steps after the end of a fault in which sums are to come down."""
 SHRINKAGE: Final = 0.02
@@ -236,29 +233,6 @@ def _lengths(whitened: Floats) -> Floats:
     """Return the lengths of rows of columns, from (W, N, C) to (W, N)."""
     lengths: Floats = np.sqrt((whitened * whitened).sum(axis=2))
     return lengths
-
-
-class Onsets:
-    """Since when an episode so far is likely to be anomalous.
-
-    The estimated onset is where a CUSUM of the energy last left zero (Page 1954), with a reference
-    of two nominal standard deviations.
-    """
-
-    def __init__(self, charts: Charts) -> None:
-        self._reference = REFERENCE * float(charts.spread_)
-        self._sum, self._now, self._onset = 0.0, 0, 0
-
-    def __call__(self, columns: Floats) -> NDArray[np.int64]:
-        """Return the onset at each of the next N steps, counted from the first step: (N,)."""
-        onsets = np.empty(len(columns), np.int64)
-        for n, energy in enumerate(columns[:, -1].tolist()):
-            if self._sum <= 0:
-                self._onset = self._now
-            self._sum = max(0.0, self._sum + energy - self._reference)
-            self._now += 1
-            onsets[n] = self._onset
-        return onsets
 
 
 def _root(smoothed: Floats, weight: float) -> Floats:
