@@ -21,6 +21,8 @@ Floats = NDArray[np.float64]
 
 TRUSTED: Final = 1e-6
 """Variance of a sensor that nobody names, standardized: for numerical safety."""
+EARLIER: Final = 10
+"""Rows before the onset at which estimates begin: an onset that is found late spoils them all."""
 FARTHEST: Final = 10.0
 """Largest distance from the mean that a value may have, in training standard deviations."""
 LARGEST: Final = 1e6
@@ -101,7 +103,8 @@ class VirtualSensor:
         self._read = np.flatnonzero(np.isfinite(variances))
         self._noise = np.diag(np.maximum(variances[self._read], TRUSTED))
         # Values of the named sensors now and one row before, and their covariance.
-        self._next = min(max(self._situation.onset, 0), len(self._situation.rows) - 1)
+        start = max(self._situation.onset - EARLIER, 0)
+        self._next = min(start, len(self._situation.rows) - 1)
         before = [self._standard(self._next - lag)[named] for lag in (1, 2)]
         self._values = np.concatenate(before)
         self._covariance = np.zeros((2 * len(named), 2 * len(named)))
