@@ -33,7 +33,7 @@ def study_cell(episodes, detector="panel", environment="hopper", anomaly="iid", 
     arms = {arm: [1.0] * 80 for arm in ARMS}
     return {
         "schema": "oodd-eval/intervention/1", "detector": detector, "detector_version": "1",
-        "plugin": "oodd_panel", "parameters": {}, "seed": 0, "horizon": 1,
+        "plugin": "oodd_panel", "parameters": {}, "overrides": {}, "seed": 0, "horizon": 1,
         "environment": environment, "anomaly": anomaly, "group": "sensor", "split": "mini",
         "split_digest": "0a1b", "act": act, "level": 0.05, "base": 950, "cap": 300,
         "provenance": {}, "seconds": 2.0, "episodes": episodes,

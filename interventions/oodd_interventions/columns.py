@@ -30,10 +30,10 @@ from oodd_eval.metrics.catalogue import ATTRIBUTION, HEADLINE, INTERVENTIONS, me
 from oodd_eval.metrics.ranking import PairedDifference, Position, differences
 from oodd_eval.results.identity import Setting
 
-StudyCell: TypeAlias = Mapping[str, Any]
+RawCell: TypeAlias = Mapping[str, Any]
 """What a study keeps of a detector, an environment, an anomaly and an act, as JSON has it."""
 
-StudyRecord: TypeAlias = dict[str, Any]
+InterventionRecord: TypeAlias = dict[str, Any]
 
 CELL: Final = "oodd-eval/intervention/1"
 RECORDS: Final = "records.jsonl"
@@ -56,8 +56,8 @@ _LEVELS: Final = (("environment", "anomaly"), ("environment",), ())
 """Fields by which cells make records, from records of one cell to those of all environments."""
 
 _IDENTITY: Final = (
-    *("detector", "detector_version", "plugin", "parameters", "seed", "horizon", "split"),
-    *("split_digest", "act", "level", "base", "cap"),
+    *("detector", "detector_version", "plugin", "parameters", "overrides", "seed"),
+    *("horizon", "split", "split_digest", "act", "level", "base", "cap"),
 )
 _OTHER: Final = {"body", "environment"}  # kinds of faults that no naming has to tell apart
 _PARTS: Final = ("sensors", "actuators")
@@ -68,13 +68,13 @@ _MOST: Final = 2**26  # bytes of a cell
 class _Part(NamedTuple):
     """A cell and the terms of its columns."""
 
-    cell: StudyCell
+    cell: RawCell
     terms: dict[str, Contribution]
 
 
-def read_cells(directory: Path) -> list[StudyCell]:
+def read_cells(directory: Path) -> list[RawCell]:
     """Return the cells of the study in a directory; `ResultsError` for a file that is none."""
-    cells: list[StudyCell] = []
+    cells: list[RawCell] = []
     for path in sorted(directory.glob("cells/*/*/*.json")):
         cell = read_json(path, _MOST, ResultsError)
         if not isinstance(cell, dict) or cell.get("schema") != CELL:
@@ -83,7 +83,7 @@ def read_cells(directory: Path) -> list[StudyCell]:
     return cells
 
 
-def write_records(directory: Path) -> list[StudyRecord]:
+def write_records(directory: Path) -> list[InterventionRecord]:
     """Compute the records of the study in a directory, write them beside its cells, return them."""
     records = records_of(read_cells(directory))
     lines = (json.dumps(record, sort_keys=True) + "\n" for record in records)
@@ -91,12 +91,12 @@ def write_records(directory: Path) -> list[StudyRecord]:
     return records
 
 
-def row_of(cell: StudyCell) -> str:
+def row_of(cell: RawCell) -> str:
     """Return the row of a cell or a record in tables: its detector with what is no default."""
-    return str(Setting.of(cell["detector"], cell["horizon"], cell["parameters"]))
+    return str(Setting.of(cell["detector"], cell["horizon"], cell["overrides"]))
 
 
-def records_of(cells: Sequence[StudyCell]) -> list[StudyRecord]:
+def records_of(cells: Sequence[RawCell]) -> list[InterventionRecord]:
     """Return the records of cells in the order of tables, those of several behind theirs.
 
     Parameters
@@ -131,11 +131,11 @@ def records_of(cells: Sequence[StudyCell]) -> list[StudyRecord]:
     return records
 
 
-def _condition(cell: StudyCell) -> Condition:
+def _condition(cell: RawCell) -> Condition:
     return Condition.parse(cell["anomaly"])
 
 
-def _check_alike(cells: Sequence[StudyCell]) -> None:
+def _check_alike(cells: Sequence[RawCell]) -> None:
     """Refuse cells that differ in what a study has in common."""
     expected: dict[str, list[Any]] = {}
     for c in cells:
@@ -160,7 +160,7 @@ def _grouped(parts: Sequence[_Part], fields: Collection[str]) -> Iterator[list[_
     yield from groups.values()
 
 
-def _record(parts: Sequence[_Part], fields: Collection[str]) -> StudyRecord:
+def _record(parts: Sequence[_Part], fields: Collection[str]) -> InterventionRecord:
     """Return the record of some cells of a row, one for each combination of some fields."""
     cells = [part.cell for part in parts]
     groups = {cell["group"] for cell in cells}
@@ -175,7 +175,7 @@ def _record(parts: Sequence[_Part], fields: Collection[str]) -> StudyRecord:
     return {**record, "intervention": figures}
 
 
-def _mean_return(cell: StudyCell, arm: str) -> float:
+def _mean_return(cell: RawCell, arm: str) -> float:
     return float(np.mean([episode["returns"][arm] for episode in cell["episodes"]]))
 
 
@@ -203,7 +203,7 @@ def _sum(terms: Sequence[Contribution]) -> Contribution:
     return Contribution(*sums)
 
 
-def _terms(cell: StudyCell) -> dict[str, Contribution]:
+def _terms(cell: RawCell) -> dict[str, Contribution]:
     """Return the terms of each column by episode."""
     episodes = cell["episodes"]
     nominal = abs(_mean_return(cell, "twin")) or math.nan

@@ -16,16 +16,15 @@ from oodd_recording.closed_loop import SHORTEST_TWIN, RecordedEpisode, Setup
 from oodd_recording.environments import make
 from oodd_recording.registered import MEASURED, info_of
 from oodd_recording.simulator import Image, quiet_streams
-from oodd_recording.svg import INK, label, svg
+from oodd_recording.svg import INK, LEFT, WIDTH, Axes, label, svg
 from oodd_recording.values import spread_of
 
 FIRST_SEED: Final = 960_000_000  # apart from those of splits, policies and calibration
 TWINS: Final = 100  # seeds among which a twin is looked for
 WIDEST: Final = 400  # pixels of a frame
 BEFORE, AFTER = 30, 90  # rows of a plot before the onset and after the effect
-WIDTH, HEIGHT = 480, 190
-LEFT, RIGHT, TOP, BOTTOM = 60, 472, 44, 152  # of the plot's axes
-TWIN, CORRUPTED, LINE = "#555555", "#d55e00", "#bbbbbb"
+HEIGHT: Final = 190  # pixels of a plot
+TWIN, CORRUPTED = "#555555", "#d55e00"
 
 
 def pictured_twin(setup: Setup) -> RecordedEpisode:
@@ -109,40 +108,21 @@ def plot(environment: str, title: str, episode: RecordedEpisode, twin: RecordedE
         for colour, e in ((TWIN, twin), (CORRUPTED, episode))
     }
     values = np.concatenate([*lines.values()])
-    low, high = float(values.min()), float(values.max())
-
-    def x(step: float) -> float:
-        return LEFT + (RIGHT - LEFT) * (step - first) / (last - first)
-
-    def y(value: float) -> float:
-        return BOTTOM - (BOTTOM - TOP) * (value - low) / ((high - low) or 1)
-
+    axes = Axes(first, last, float(values.min()), float(values.max()))
     quantity = info_of(environment).sensors[sensor]
     unit = "" if quantity.unit == "1" else f" ({quantity.unit})"
     shapes = [
         label(LEFT, 16, title, "start", "bold"),
         label(LEFT, 34, quantity.name + unit, "start"),
-        label(x(onset), HEIGHT - 6, f"onset, step {onset}"),
-        f'<path d="M{x(onset):.1f} {TOP}V{BOTTOM + 6}" stroke="{INK}" stroke-dasharray="4 3"/>',
+        label(axes.x(onset), HEIGHT - 6, f"onset, step {onset}"),
+        axes.mark(onset, f'stroke="{INK}" stroke-dasharray="4 3"'),
+        *axes.ends(),
     ]
-    for value in (low, high):
-        shapes.append(label(LEFT - 6, y(value) + 4, _number(value, high - low), "end"))
-        shapes.append(f'<path d="M{LEFT} {y(value):.1f}H{RIGHT}" stroke="{LINE}"/>')
-    ends = (first, "start"), (last, "end")
-    shapes += [label(x(step), BOTTOM + 16, f"{step}", anchor) for step, anchor in ends]
     for colour, line in lines.items():
-        points = " ".join(f"{x(first + i):.1f},{y(value):.1f}" for i, value in enumerate(line))
-        shapes.append(f'<polyline points="{points}" stroke="{colour}" stroke-width="1.5"/>')
+        shapes.append(axes.line(enumerate(line, first), f'stroke="{colour}" stroke-width="1.5"'))
     if (end := len(episode.trajectory) - 1) < last:
         shapes.append(
-            f'<circle cx="{x(end):.1f}" cy="{y(lines[CORRUPTED][-1]):.1f}" r="3.5" '
+            f'<circle cx="{axes.x(end):.1f}" cy="{axes.y(lines[CORRUPTED][-1]):.1f}" r="3.5" '
             f'fill="{CORRUPTED}"/>'
         )
     return svg(WIDTH, HEIGHT, shapes)
-
-
-def _number(value: float, size: float) -> str:
-    """Return a number with as few digits as its axis, of a size, can do with."""
-    texts = (f"{float(f'{value:.{digits}g}') + 0:g}" for digits in range(2, 7))
-    near = (text for text in texts if abs(float(text) - value) <= size / 4)
-    return next(near, f"{value:g}")  # neither 1.2e+02 nor -0

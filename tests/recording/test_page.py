@@ -10,7 +10,7 @@ import pytest
 from helpers_docs import ROOT
 from helpers_own import BASIN, forget_own
 from helpers_plugins import install
-from oodd_recording import pictures
+from oodd_recording import pictures, svg
 from oodd_recording.closed_loop import RecordedEpisode
 from oodd_recording.environments import make
 
@@ -135,11 +135,11 @@ def test_a_plot_shows_both_lines_around_the_onset():
     twin, broken = re.findall(r'points="([^"]+)"', drawn)
     twin, broken = ([tuple(map(float, p.split(","))) for p in x.split()] for x in (twin, broken))
     assert len(twin) == len(broken) == 121  # 30 rows before the onset, and 90 after
-    assert twin[0] == (pictures.LEFT, pictures.BOTTOM)
+    assert twin[0] == (svg.LEFT, svg.BOTTOM)
     assert twin[:30] == broken[:30]
-    assert {y for _, y in twin} == {pictures.BOTTOM}
-    assert {y for _, y in broken[30:]} == {pictures.TOP}
-    assert broken[-1] == (pictures.RIGHT, pictures.TOP)
+    assert {y for _, y in twin} == {svg.BOTTOM}
+    assert {y for _, y in broken[30:]} == {svg.TOP}
+    assert broken[-1] == (svg.RIGHT, svg.TOP)
     assert "<circle" not in drawn
 
 
@@ -300,7 +300,7 @@ def test_an_environment_that_renders_gets_a_frame(basin, tmp_path):
 
 
 def test_numbers_of_an_axis_have_digits_enough_to_tell_its_ends_apart():
-    assert pictures._number(1.02, 10.0) == "1"
-    assert pictures._number(12.26, 0.5) == "12.3"
-    assert pictures._number(-0.0, 1.0) == "0"
-    assert pictures._number(123.0, 300.0) == "120"
+    assert svg._number(1.02, 10.0) == "1"
+    assert svg._number(12.26, 0.5) == "12.3"
+    assert svg._number(-0.0, 1.0) == "0"
+    assert svg._number(123.0, 300.0) == "120"
