@@ -10,32 +10,32 @@ Returns count in shares of the mean return of a cell's nominal twins. Seeds are 
 for the detectors and the kinds of an environment.
 """
 
-import itertools
 import json
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, NamedTuple, TypeAlias
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 
 from oodd_eval.data.bounded import read_json, without_nan
-from oodd_eval.data.condition import Condition, in_suite_order
-from oodd_eval.data.facts import ENVIRONMENTS, in_order
 from oodd_eval.data.files import write_text
 from oodd_eval.errors import ResultsError
+from oodd_eval.metrics.alarms import naming_contributions
 from oodd_eval.metrics.auc import Contribution, mean_of
 from oodd_eval.metrics.bootstrap import drawn_cell, mean_interval, mean_over_cells, nan_mean
 from oodd_eval.metrics.catalogue import ATTRIBUTION, HEADLINE, INTERVENTIONS, metric_info
-from oodd_eval.metrics.ranking import PairedDifference, Position, differences
+from oodd_eval.metrics.ranking import Position, differences
+from oodd_eval.plugins.explanations import KINDS, NAMED
 from oodd_eval.results.identity import Setting
 
 RawCell: TypeAlias = Mapping[str, Any]
 """What a study keeps of a detector, an environment, an anomaly and an act, as JSON has it."""
 
 InterventionRecord: TypeAlias = dict[str, Any]
+_Terms: TypeAlias = dict[str, Contribution]
+_Parts: TypeAlias = Sequence[tuple[RawCell, _Terms]]
 
-CELL: Final = "oodd-eval/intervention/1"
 RECORDS: Final = "records.jsonl"
 
 ALL: Final = "all"
@@ -44,43 +44,23 @@ ALL: Final = "all"
 LEAST: Final = 0.05
 """Share of the nominal return from which on a fault costs, and acting on it saves, something."""
 
-COLUMNS: Final = {
-    **INTERVENTIONS,
-    **{name.removesuffix(f"_{HEADLINE}"): metric_info(name) for name in ATTRIBUTION},
-}
-"""Facts about the columns by name, those of namings last."""
+NAMINGS: Final = {name.removesuffix(f"_{HEADLINE}"): metric_info(name) for name in ATTRIBUTION[1:]}
+"""Facts about the columns of namings: all but the sensor that is named first."""
+
+COLUMNS: Final = {**INTERVENTIONS, **NAMINGS}
+"""Facts about all columns by name."""
 
 ARMS: Final = ("twin", "never", "watchdog", "oracle", "placebo", "false", "forced")
 
-_LEVELS: Final = (("environment", "anomaly"), ("environment",), ())
-"""Fields by which cells make records, from records of one cell to those of all environments."""
-
-_IDENTITY: Final = (
-    *("detector", "detector_version", "plugin", "parameters", "overrides", "seed"),
-    *("horizon", "split", "split_digest", "act", "level", "base", "cap"),
-)
-_OTHER: Final = {"body", "environment"}  # kinds of faults that no naming has to tell apart
-_PARTS: Final = ("sensors", "actuators")
-_NAMED: Final = 0.5  # probability from which on a part is named
+_RAW: Final = ("schema", "episodes", "curves", "provenance", "seconds")  # not in records
+_ALIKE: Final = {"body", "environment"}  # kinds of faults that a naming need not tell apart
 _MOST: Final = 2**26  # bytes of a cell
 
 
-class _Part(NamedTuple):
-    """A cell and the terms of its columns."""
-
-    cell: RawCell
-    terms: dict[str, Contribution]
-
-
 def read_cells(directory: Path) -> list[RawCell]:
-    """Return the cells of the study in a directory; `ResultsError` for a file that is none."""
-    cells: list[RawCell] = []
-    for path in sorted(directory.glob("cells/*/*/*.json")):
-        cell = read_json(path, _MOST, ResultsError)
-        if not isinstance(cell, dict) or cell.get("schema") != CELL:
-            raise ResultsError(f"{str(path)!r} is no cell of a study: expected the schema {CELL!r}")
-        cells.append(cell)
-    return cells
+    """Return the cells of the study in a directory."""
+    paths = sorted(directory.glob("cells/*/*/*.json"))
+    return [read_json(path, _MOST, ResultsError) for path in paths]
 
 
 def write_records(directory: Path) -> list[InterventionRecord]:
@@ -107,197 +87,144 @@ def records_of(cells: Sequence[RawCell]) -> list[InterventionRecord]:
     Raises
     ------
     ResultsError
-        When cells are of different splits, levels, caps or seeds: then no mean can be over them.
+        When cells of an environment are of different splits, levels or seeds.
     """
-    _check_alike(cells)
-    names = in_order((cell["environment"] for cell in cells), ENVIRONMENTS)
-    kinds = in_suite_order(_condition(cell) for cell in cells)
-    ordered = sorted(
-        cells,
-        key=lambda c: (
-            *(c["act"], row_of(c), names.index(c["environment"]), kinds.index(_condition(c))),
-        ),
-    )
-    parts = [_Part(cell, _terms(cell)) for cell in ordered]
+    parts = [(cell, _terms(cell)) for cell in sorted(cells, key=_key)]
+    alike: dict[str, list[Any]] = {}
+    for cell, _ in parts:
+        facts = [cell["split_digest"], cell["level"], *(e["seed"] for e in cell["episodes"])]
+        if alike.setdefault(cell["environment"], facts) != facts:
+            raise ResultsError(
+                f"cells of {cell['environment']} are of several studies, expected one split, level "
+                "and list of seeds: name another directory, or begin anew with --fresh"
+            )
     behind = _behind(parts)
     records = []
-    for fields in _LEVELS:
-        for group in _grouped(parts, ("act", *fields)):
-            record = _record(group, fields)
-            if not fields and (test := behind.get((record["act"], row_of(record)))):
-                figures = {"value": test.difference, "low": test.low, "high": test.high}
-                record["behind"] = without_nan({"row": test.first, **figures, "p": test.p})
-            records.append(record)
+    for scope in (4, 3, 2):
+        groups: dict[tuple[str, ...], list[tuple[RawCell, _Terms]]] = {}
+        for part in parts:
+            groups.setdefault(_key(part[0])[:scope], []).append(part)
+        records += [_record(group, scope, behind.get(key, {})) for key, group in groups.items()]
     return records
 
 
-def _condition(cell: RawCell) -> Condition:
-    return Condition.parse(cell["anomaly"])
+def _key(cell: RawCell) -> tuple[str, str, str, str]:
+    return cell["act"], row_of(cell), cell["environment"], cell["anomaly"]
 
 
-def _check_alike(cells: Sequence[RawCell]) -> None:
-    """Refuse cells that differ in what a study has in common."""
-    expected: dict[str, list[Any]] = {}
-    for c in cells:
-        seeds = [episode["seed"] for episode in c["episodes"]]
-        study = [c["split_digest"], c["level"], c["base"]]
-        for scope, facts in (("", study), (c["environment"], [c["cap"], *seeds])):
-            if (first := expected.setdefault(scope, facts)) != facts:
-                raise ResultsError(
-                    f"the cell {c['environment']}/{row_of(c)}/{c['anomaly']}--{c['act']} has "
-                    f"{facts}, expected {first} as in the cells before it: cells of one study are "
-                    "of one split, level, cap and the same seeds; run it with --fresh, or name "
-                    "another directory with --output"
-                )
+def _record(parts: _Parts, scope: int, behind: Mapping[str, Any]) -> InterventionRecord:
+    """Return the record of cells of a row that share the fields of a key up to a scope."""
+    cell = parts[0][0]
+    record = {name: value for name, value in cell.items() if name not in _RAW}
+    if scope < 4:
+        record |= dict.fromkeys(("environment", "anomaly", "group")[scope - 2 :], ALL)
+    else:
+        record["returns"] = {arm: float(_returns(cell, arm).mean()) for arm in ARMS}
+    record |= {"behind": behind} if behind else {}
+    plain: InterventionRecord = without_nan(
+        record | {"intervention": {name: _figure(parts, name) for name in COLUMNS}}
+    )
+    return plain
 
 
-def _grouped(parts: Sequence[_Part], fields: Collection[str]) -> Iterator[list[_Part]]:
-    """Yield the parts of each row and combination of fields, in their order."""
-    groups: dict[tuple[str, ...], list[_Part]] = {}
-    for part in parts:
-        key = (row_of(part.cell), *(part.cell[field] for field in fields))
-        groups.setdefault(key, []).append(part)
-    yield from groups.values()
-
-
-def _record(parts: Sequence[_Part], fields: Collection[str]) -> InterventionRecord:
-    """Return the record of some cells of a row, one for each combination of some fields."""
-    cells = [part.cell for part in parts]
-    groups = {cell["group"] for cell in cells}
-    returns = {arm: np.mean([_mean_return(cell, arm) for cell in cells]) for arm in ARMS}
-    figures = {name: _figure(parts, name) for name in COLUMNS if name in parts[0].terms}
-    of = {name: cells[0][name] if name in fields else ALL for name in _LEVELS[0]}
-    record = {name: cells[0][name] for name in _IDENTITY} | of
-    record["group"] = groups.pop() if len(groups) == 1 else ALL
-    record |= {"cells": len(cells), "seconds": math.fsum(cell["seconds"] for cell in cells)}
-    if "environment" in fields:  # returns of several environments have no mean
-        record["returns"] = {arm: float(mean) for arm, mean in returns.items()}
-    return {**record, "intervention": figures}
-
-
-def _mean_return(cell: RawCell, arm: str) -> float:
-    return float(np.mean([episode["returns"][arm] for episode in cell["episodes"]]))
-
-
-def _figure(parts: Sequence[_Part], name: str) -> dict[str, Any]:
+def _figure(parts: _Parts, name: str) -> dict[str, float]:
     """Return a column of some cells: its value with the interval, and the number of episodes."""
-    info = COLUMNS[name]
-    by_environment: dict[str, list[Contribution]] = {}
-    for cell, terms in parts:
-        by_environment.setdefault(cell["environment"], []).append(terms[name])
-    drawn = [
-        drawn_cell(environment, 0, terms)
-        for environment, of_cells in by_environment.items()
-        # A ratio is one of sums over kinds; a median is the mean of theirs.
-        for terms in (of_cells if info.median else [_sum(of_cells)])
-    ]
-    value = mean_over_cells((0, value) for cell in drawn for value in cell.values)
-    low, high = mean_interval(drawn, kind=info.interval)
-    n = sum(terms[name].n for _, terms in parts)
-    return {**without_nan({"value": value, "low": low, "high": high}), "n": n}
+    info, terms = COLUMNS[name], [(cell["environment"], terms[name]) for cell, terms in parts]
+    pooled = terms if info.median else [*_pooled(terms).items()]
+    low, high = mean_interval([drawn_cell(e, 0, c) for e, c in pooled], kind=info.interval)
+    value = mean_over_cells((0, c.value) for _, c in pooled)
+    return {"value": value, "low": low, "high": high, "n": sum(c.n for _, c in terms)}
 
 
-def _sum(terms: Sequence[Contribution]) -> Contribution:
-    """Return the ratio of sums over cells of the same seeds."""
-    sums = (np.sum([getattr(t, end) for t in terms], 0) for end in ("numerator", "denominator"))
-    return Contribution(*sums)
+def _pooled(terms: Iterable[tuple[str, Contribution]]) -> dict[str, Contribution]:
+    """Return ratios of sums over the cells of each environment, which have the same seeds."""
+    groups: dict[str, list[Contribution]] = {}
+    for environment, contribution in terms:
+        groups.setdefault(environment, []).append(contribution)
+    terms_of = {e: [(c.numerator, c.denominator) for c in group] for e, group in groups.items()}
+    return {e: Contribution(*np.sum(of, axis=0)) for e, of in terms_of.items()}
 
 
-def _terms(cell: RawCell) -> dict[str, Contribution]:
+def _returns(cell: RawCell, arm: str) -> Any:
+    return np.array([episode["returns"][arm] for episode in cell["episodes"]])
+
+
+def _terms(cell: RawCell) -> _Terms:
     """Return the terms of each column by episode."""
     episodes = cell["episodes"]
-    nominal = abs(_mean_return(cell, "twin")) or math.nan
+    nominal = abs(_returns(cell, "twin").mean()) or math.nan
     twin, never, watchdog, oracle, placebo, false, forced = (
-        np.array([episode["returns"][arm] for episode in episodes]) / nominal for arm in ARMS
+        _returns(cell, arm) / nominal for arm in ARMS
     )
-    pays = np.mean(oracle - never) >= LEAST
-    harmless = np.mean(twin - never) < LEAST
-    failed = {arm: np.array([e["failed"][arm] for e in episodes], float) for arm in ARMS}
-    acts = [e["acted"]["watchdog"] for e in episodes]
-    delays = [
-        math.nan if act is None or act < e["effect"] else float(act - e["effect"])
-        for act, e in zip(acts, episodes, strict=True)
-    ]
+    pays = (oracle - never).mean() >= LEAST
+    harmless = (twin - never).mean() < LEAST
+    fails, fails_still = (
+        np.array([e["failed"][arm] for e in episodes], float) for arm in ("never", "watchdog")
+    )
+    effects = np.array([e["effect"] for e in episodes], float)
+    acts = np.array([e["acted"]["watchdog"] for e in episodes], float)  # NaN without one
     unneeded = twin - false + harmless * (never - watchdog)
-    terms = {
-        "return_saved": Contribution((watchdog - never) * pays, (oracle - never) * pays),
-        "placebo_saved": Contribution((placebo - never) * pays, (oracle - never) * pays),
-        "safety_gain": mean_of(failed["never"] - failed["watchdog"]),
-        "residual_hazard": mean_of(failed["watchdog"]),
-        "availability_cost": Contribution(unneeded, np.full(len(episodes), 1.0 + harmless)),
+    return _naming(episodes) | {
+        "return_saved": Contribution(pays * (watchdog - never), pays * (oracle - never)),
+        "placebo_saved": Contribution(pays * (placebo - never), pays * (oracle - never)),
+        "safety_gain": mean_of(fails - fails_still),
+        "residual_hazard": mean_of(fails_still),
+        "availability_cost": Contribution(unneeded, np.full(len(acts), 1.0 + harmless)),
         "harm_on_nominal": mean_of(twin - false),
         "forced_harm": mean_of(twin - forced),
-        "acted": mean_of([float(act is not None) for act in acts]),
-        "act_delay": mean_of(delays, median=True),
-    }
-    named = [_naming(episode) for episode in episodes]
-    values = {name: [of_episode.get(name, math.nan) for of_episode in named] for name in COLUMNS}
-    return terms | {
-        name: mean_of(numbers, median=COLUMNS[name].median)
-        for name, numbers in values.items()
-        if name not in INTERVENTIONS
+        "acted": mean_of(np.isfinite(acts).astype(float)),
+        "act_delay": mean_of(np.where(acts >= effects, acts - effects, math.nan), median=True),
     }
 
 
-def _naming(episode: Mapping[str, Any]) -> dict[str, float]:
-    """Return what the naming at an alarm from the effect on is worth, by column."""
-    if episode["alarm"] is None or episode["alarm"] < episode["effect"] or not episode["named"]:
-        return {}
-    true, named = episode["parts"], episode["named"]["0"]
-    is_right = named["kind"] == true["kind"] or {named["kind"], true["kind"]} <= _OTHER
-    values = {"kind_named": float(is_right), "onset_error": math.nan}
-    if named["onset"] >= 0:
-        values["onset_error"] = float(abs(named["onset"] - episode["effect"]))
-    at_fault = {(field, i) for field in _PARTS for i in true[field]}
-    if not at_fault:
-        return values
-    for rows, suffix in (("0", ""), ("20", "_20")):
-        if rows in episode["named"]:
-            parts = _named(episode["named"][rows])
-            values[f"named_recall{suffix}"] = len(parts & at_fault) / len(at_fault)
-            if parts:
-                values[f"named_precision{suffix}"] = len(parts & at_fault) / len(parts)
-    every = {(field, i) for field in _PARTS for i in range(len(named[field]))}
-    values["named_chance"] = len(every & at_fault) / len(every)
-    if true["sensors"]:
-        largest = episode["largest"]["0"][: len(_named(named))]
-        values["named_largest"] = len({*largest} & {*true["sensors"]}) / len(true["sensors"])
-    return values
+def _naming(episodes: Sequence[Mapping[str, Any]]) -> _Terms:
+    """Return the terms of the columns of namings, at alarms from the effect on."""
+    named = [e["named"] if e["named"] and e["alarm"] >= e["effect"] else {} for e in episodes]
+
+    def width(field: str) -> int:
+        lengths = (len(naming["0"][field]) for naming in named if naming)
+        return max([0, *lengths, *(1 + i for e in episodes for i in e["parts"][field])])
+
+    sensors = width("sensors")
+    faulty = np.zeros((len(episodes), max(1, sensors + width("actuators"))), bool)
+    namings = np.full((len(episodes), 3, 1 + faulty.shape[1]), -1, np.int8)
+    kinds, errors = [], []
+    for row, fault, episode, naming in zip(namings, faulty, episodes, named, strict=True):
+        true, first = episode["parts"], naming.get("0")
+        fault[[*true["sensors"], *(sensors + i for i in true["actuators"])]] = True
+        kinds.append(
+            [KINDS.index(k) for k in KINDS if k == true["kind"] or {k, true["kind"]} <= _ALIKE]
+        )
+        errors.append(abs(first["onset"] - episode["effect"]) if first else math.nan)
+        if first:
+            for time, at in enumerate((first, naming.get("20", first))):
+                parts = np.array([*at["sensors"], *at["actuators"]]) >= NAMED
+                row[time, : 1 + len(parts)] = KINDS.index(at["kind"]) or -1, *parts
+            largest = episode["largest"]["0"][: (row[0, 1:] > 0).sum()]
+            row[2, [1 + sensor for sensor in largest]] = 1
+    judged = np.array([bool(naming) for naming in named])
+    terms = naming_contributions(namings, faulty, kinds, judged)
+    return terms | {"onset_error": mean_of(errors, median=True)}
 
 
-def _named(naming: Mapping[str, Any]) -> set[tuple[str, int]]:
-    """Return the parts that a naming names."""
-    return {(field, i) for field in _PARTS for i, p in enumerate(naming[field]) if p >= _NAMED}
-
-
-def _behind(parts: Sequence[_Part]) -> dict[tuple[str, str], PairedDifference]:
+def _behind(parts: _Parts) -> dict[tuple[str, ...], dict[str, Any]]:
     """Return the difference of each row from the one that saves most, by act and row.
 
     Rows are compared where all of an act have a value, with Holm's correction within the act.
     """
-    by_act: dict[str, dict[str, dict[Position, Contribution]]] = {}
+    acts: dict[str, dict[str, dict[Position, Contribution]]] = {}
     for cell, terms in parts:
-        if not math.isnan(terms["return_saved"].value):
-            cells = by_act.setdefault(cell["act"], {}).setdefault(row_of(cell), {})
-            cells[cell["environment"], cell["anomaly"]] = terms["return_saved"]
-    behind: dict[tuple[str, str], PairedDifference] = {}
-    for act, rows in by_act.items():
-        common = sorted(set.intersection(*({*cells} for cells in rows.values())))
-        compared = {row: {0: _by_environment(rows[row], common)} for row in rows}
-        means = {
-            row: nan_mean(c.value for c in cells[0].values()) for row, cells in compared.items()
-        }
-        best = max(means, key=lambda row: means[row])
+        act, row, environment, anomaly = _key(cell)
+        if not math.isnan((saved := terms["return_saved"]).value):
+            acts.setdefault(act, {}).setdefault(row, {})[environment, anomaly] = saved
+    behind: dict[tuple[str, ...], dict[str, Any]] = {}
+    for act, rows in acts.items():
+        common = sorted(set.intersection(*map(set, rows.values())))
+        pooled = {row: _pooled((p[0], of[p]) for p in common) for row, of in rows.items()}
+        best = max(rows, key=lambda row: nan_mean(c.value for c in pooled[row].values()))
+        compared = {row: {0: {(e, ALL): c for e, c in of.items()}} for row, of in pooled.items()}
         pairs = [(best, row) for row in rows if row != best and common]
-        behind |= {(act, test.second): test for test in differences(compared, pairs)}
+        for test in differences(compared, pairs):
+            figures = {"value": test.difference, "low": test.low, "high": test.high, "p": test.p}
+            behind[act, test.second] = {"row": best, **figures}
     return behind
-
-
-def _by_environment(
-    cells: Mapping[Position, Contribution], positions: Sequence[Position]
-) -> dict[Position, Contribution]:
-    """Return the sums of a column over the kinds of each environment."""
-    return {
-        (environment, ALL): _sum([cells[position] for position in of_environment])
-        for environment, of_environment in itertools.groupby(positions, lambda p: p[0])
-    }
