@@ -10,17 +10,13 @@ Returns count in shares of the mean return of a cell's nominal twins. Seeds are 
 for the detectors and the kinds of an environment.
 """
 
-import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any, Final, TypeAlias
 
 import numpy as np
 
-from oodd_eval.data.bounded import read_json, without_nan
-from oodd_eval.data.files import write_text
-from oodd_eval.errors import ResultsError
+from oodd_eval.data.bounded import without_nan
 from oodd_eval.metrics.alarms import naming_contributions
 from oodd_eval.metrics.auc import Contribution, mean_of
 from oodd_eval.metrics.bootstrap import drawn_cell, mean_interval, mean_over_cells, nan_mean
@@ -35,8 +31,6 @@ RawCell: TypeAlias = Mapping[str, Any]
 InterventionRecord: TypeAlias = dict[str, Any]
 _Terms: TypeAlias = dict[str, Contribution]
 _Parts: TypeAlias = Sequence[tuple[RawCell, _Terms]]
-
-RECORDS: Final = "records.jsonl"
 
 ALL: Final = "all"
 """The anomaly, the group or the environment of a record that is of several."""
@@ -54,21 +48,6 @@ ARMS: Final = ("twin", "never", "watchdog", "oracle", "placebo", "false", "force
 
 _RAW: Final = ("schema", "episodes", "curves", "provenance", "seconds")  # not in records
 _ALIKE: Final = {"body", "environment"}  # kinds of faults that a naming need not tell apart
-_MOST: Final = 2**26  # bytes of a cell
-
-
-def read_cells(directory: Path) -> list[RawCell]:
-    """Return the cells of the study in a directory."""
-    paths = sorted(directory.glob("cells/*/*/*.json"))
-    return [read_json(path, _MOST, ResultsError) for path in paths]
-
-
-def write_records(directory: Path) -> list[InterventionRecord]:
-    """Compute the records of the study in a directory, write them beside its cells, return them."""
-    records = records_of(read_cells(directory))
-    lines = (json.dumps(record, sort_keys=True) + "\n" for record in records)
-    write_text(directory / RECORDS, "".join(lines))
-    return records
 
 
 def row_of(cell: RawCell) -> str:
@@ -82,22 +61,9 @@ def records_of(cells: Sequence[RawCell]) -> list[InterventionRecord]:
     Parameters
     ----------
     cells
-        As `read_cells` returns them.
-
-    Raises
-    ------
-    ResultsError
-        When cells of an environment are of different splits, levels or seeds.
+        Of one study, so that those of an environment have the same seeds.
     """
     parts = [(cell, _terms(cell)) for cell in sorted(cells, key=_key)]
-    alike: dict[str, list[Any]] = {}
-    for cell, _ in parts:
-        facts = [cell["split_digest"], cell["level"], *(e["seed"] for e in cell["episodes"])]
-        if alike.setdefault(cell["environment"], facts) != facts:
-            raise ResultsError(
-                f"cells of {cell['environment']} are of several studies, expected one split, level "
-                "and list of seeds: name another directory, or begin anew with --fresh"
-            )
     behind = _behind(parts)
     records = []
     for scope in (4, 3, 2):
@@ -183,7 +149,7 @@ def _naming(episodes: Sequence[Mapping[str, Any]]) -> _Terms:
 
     def width(field: str) -> int:
         lengths = (len(naming["0"][field]) for naming in named if naming)
-        return max([0, *lengths, *(1 + i for e in episodes for i in e["parts"][field])])
+        return int(max([0, *lengths, *(1 + i for e in episodes for i in e["parts"][field])]))
 
     sensors = width("sensors")
     faulty = np.zeros((len(episodes), max(1, sensors + width("actuators"))), bool)

@@ -77,11 +77,16 @@ def escape(text: str) -> str:
 @renders("html", "HTML")
 def html(report: Report) -> str:
     """Return a report as HTML, without a page around it."""
+    return html_sections(report.sections)
+
+
+def html_sections(sections: Sequence[Section]) -> str:
+    """Return sections as HTML."""
     marks = {"title": "<h3>{}</h3>", "sentence": "<p>{}</p>", "table": "<h4>{}</h4>"}
     # tabulate's layout escapes the cells.
     parts = (
         grid(part, "html") if isinstance(part, Table) else marks[kind].format(escape_html(part))
-        for kind, part in _parts(report)
+        for kind, part in _parts(sections)
     )
     return "\n".join(parts) + "\n"
 
@@ -94,14 +99,14 @@ def latex(report: Report) -> str:
         grid(part, "latex_raw", _latex)
         if isinstance(part, Table)
         else marks[kind].format(_latex(part))
-        for kind, part in _parts(report)
+        for kind, part in _parts(report.sections)
     )
     return "\n\n".join(parts) + "\n"
 
 
-def _parts(report: Report) -> Iterator[tuple[str, str | Table]]:
+def _parts(sections: Sequence[Section]) -> Iterator[tuple[str, str | Table]]:
     """Yield titles, sentences, and tables after their titles, in the order of a report."""
-    for section in report.sections:
+    for section in sections:
         yield "title", section.title
         sentences = filter(None, (section.verdict, *section.facts, *section.findings))
         yield from (("sentence", line) for line in sentences)
