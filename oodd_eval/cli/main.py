@@ -81,6 +81,10 @@ COMMANDS: Final[Mapping[str, Commands]] = {
         "scan": ("find odd episodes in recorded logs", "oodd_logs.commands.scan_logs:scan"),
         "compare": ("compare rows, or results with a reference", "oodd_eval.cli.compare:compare"),
         "forget": ("remove cells from a results directory", "oodd_eval.cli.forget:forget"),
+        "intervene": (
+            "tell what acting at an alarm saves (extra sim)",
+            "oodd_interventions.commands:intervene",
+        ),
         "reproduce": ("compute the paper's tables and claims", "oodd_paper.command:reproduce"),
     },
     "Look up": {

@@ -19,7 +19,8 @@ from oodd_eval.errors import MissingExtraError, UsageError
 WRITTEN = {
     "run": {"output"}, "scan": {"keep", "drop", "json", "html", "rerun", "mcap"},
     "forget": {"directory"},
-    "compare": {"junit", "markdown", "write_reference"}, "reproduce": {"output"}, "new": {"output"},
+    "compare": {"junit", "markdown", "write_reference"}, "reproduce": {"output"},
+    "intervene": {"output"}, "new": {"output"},
     "data inspect": {"recipe", "json"}, "data import": {"output", "json"},
     "data fetch": {"output"},
     "data export": {"output"}, "data build": {"output"}, "data calibrate": {"output", "work"},

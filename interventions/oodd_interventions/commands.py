@@ -1,0 +1,104 @@
+"""``oodd-eval intervene``: what an alarm saves.
+
+The evaluator knows it by name only (`oodd_eval.cli.main`).
+"""
+
+import time
+
+import click
+
+from oodd_eval.cli import (
+    COUNT,
+    NAMES,
+    OUTPUT_DIRECTORY,
+    PARAM,
+    PARAMETER,
+    Name,
+    Names,
+    Options,
+    command,
+    jobs_option,
+    say,
+)
+from oodd_eval.cli.console import make_console
+from oodd_eval.names import counted
+from oodd_eval.prose import print_prose, print_sections
+from oodd_eval.scoring.display import Pace
+from oodd_interventions import study
+from oodd_interventions.columns import records_of
+from oodd_interventions.page import REPORT, sections, write_pages
+
+
+@command(
+    "intervene --detector mewma-a --env cartpole",
+    "intervene --detector panel-a,riqn --env all --act mask --jobs 2",
+)
+@click.option("--detector", required=True, type=Names("detectors"), help=NAMES)
+@click.option("--env", required=True, type=Names("envs"), help=NAMES)
+@click.option("--split", default="mini", type=Name("splits"), help="recorded split to fit on")
+@click.option("--kind", default="all", type=Names("anomalies"), help="kinds of anomalies")
+@click.option("--act", default="all", metavar="NAMES", help="acts, such as mask, stop and switch")
+@click.option("--seeds", default=10, type=COUNT, help="episodes of each kind, recorded anew")
+@click.option("--base", default=study.BASE, type=COUNT, help="millions of the first seed")
+@click.option(
+    "--level",
+    default=5.0,
+    metavar="PERCENT",
+    type=click.FloatRange(0, 100, min_open=True, max_open=True),
+    help="alarms at most in this percentage of nominal episodes",
+)
+@click.option("--param", multiple=True, type=PARAMETER, help=PARAM)
+@jobs_option
+@click.option("--fresh", is_flag=True, help="fit and run again what the directory has already")
+@click.option("--output", default="oodd-interventions", type=OUTPUT_DIRECTORY, help="directory")
+def intervene(options: Options) -> int:
+    """Tell what an alarm saves: the simulator goes on from it with an act.
+
+    Episodes run again with the same faults. At its alarm an act takes over from the policy, such as
+    one that no longer trusts the sensors that the detector names. The return that this saves stands
+    beside that of acting at once on the true parts, and of acting at another episode's alarm.
+
+    What was done is kept: the same command goes on. The exit code is 1 when a detector failed.
+    """
+    console, pace = make_console(), Pace(0, time.perf_counter())
+    progress = make_console(quiet=options.verbosity < 0)
+
+    def observe(done: int, total: int, text: str) -> None:
+        if not pace.total:  # what an earlier call has done comes with the first message
+            pace.total, pace.done = total, done
+        for _ in range(done - pace.done):
+            pace.add(time.perf_counter(), resumed=False)
+        progress.print(f"{text:<32}  {pace}")
+
+    try:
+        done = study.intervene(
+            options.detector,
+            options.env,
+            split=options.split,
+            kinds=options.kind,
+            acts=options.act,
+            seeds=options.seeds,
+            base=options.base,
+            level=options.level / 100,
+            parameters=dict(options.param),
+            jobs=options.jobs,
+            fresh=options.fresh,
+            output=options.output,
+            observer=observe,
+        )
+    except KeyboardInterrupt:
+        say(f"what was done is kept in {options.output}; the same command continues")
+        raise
+    for name, reason in done.reasons.items():
+        print_prose(f"FAILED {name}: {reason}", console, "red")
+    if not done.cells:
+        return 1 if done.reasons else say("no act suits these kinds of anomalies", 5)
+    write_pages(done.output, done.cells)
+    parts = sections(records_of(done.cells))
+    if options.verbosity >= 0:
+        print_sections(parts, console)
+    else:
+        print_prose("\n".join(part.verdict for part in parts if part.verdict), console)
+    cells = counted(len(done.cells), "cell(s)")
+    console.print(f"{cells} in {done.output}, tables in {REPORT}, plots in ENVIRONMENT.html")
+    return int(bool(done.reasons))
