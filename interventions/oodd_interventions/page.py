@@ -69,16 +69,19 @@ def _of_act(act: str, records: Records) -> Section:
     parts = [r for r in records if r["environment"] != ALL and (r["anomaly"] == ALL) == several]
     saved = {(row_of(r), r["environment" if several else "anomaly"]): _saved(r) for r in parts}
     names = in_order((name for _, name in saved), ENVIRONMENTS)
-    header = ["detector", "mean", *names, "harm on nominal", "behind the best"]
+    header = ["detector", "mean", "harm on nominal", "behind the best", *names]
     lines = []
     for r in rows:
         row, mean = row_of(r), f"{_ends(r['intervention'][_SAVED])} ({_text(r, _PLACEBO)})"
         behind = f"{_ends(test)}, p {test['p']:.2g}" if (test := r.get("behind")) else ""
         of_names = (saved.get((row, name), "") for name in names)
-        lines.append([row, mean, *of_names, _text(r, _HARM), behind])
+        lines.append([row, mean, _text(r, _HARM), behind, *of_names])
+    table = Table(f"Return saved by {act}, in brackets the placebo (%)", header, lines, wrap=True)
+    if not any(line[3] for line in lines):  # one row, or one of several environments
+        table = table.columns([i for i in range(len(header)) if i != 3])
     title = f"What {act} prevents and costs (delay in rows, the rest in %)"
     tables = [
-        Table(f"Return saved by {act}, in brackets the placebo (%)", header, lines, wrap=True),
+        table,
         _table(title, rows, [*INTERVENTIONS][2:]),
         *_useless(act, [r for r in cells if math.isnan(_value(r, _SAVED))]),
     ]
