@@ -45,10 +45,13 @@ from oodd_eval.names import select
 from oodd_eval.plugins.contract import StorableDetector
 from oodd_eval.plugins.discovery import Plugins, describe, discover
 from oodd_eval.plugins.state import pack, read_state, write_state
+from oodd_eval.prose import terminal_text
 from oodd_eval.results.record import gather
 from oodd_eval.scoring.plan import Unit, make_plan
 from oodd_interventions.acts import ACTS
+from oodd_interventions.columns import InterventionRecord, records_of
 from oodd_interventions.loop import FittedDetector, Loop, Pair, oracle_arms, run_cell
+from oodd_interventions.page import sections
 from oodd_interventions.situation import ActSpec
 
 DETECTOR: Final = "detector."
@@ -77,6 +80,15 @@ class Interventions:
     output: Path
     cells: Sequence[Mapping[str, Any]]
     reasons: Mapping[str, str]
+
+    @property
+    def records(self) -> list[InterventionRecord]:
+        """Records of the cells, see `oodd_interventions.columns`."""
+        return records_of(self.cells)
+
+    def __str__(self) -> str:
+        """Return the tables as a terminal shows them."""
+        return terminal_text(sections(self.records))
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,6 +139,7 @@ class StudyCell:
             "detector_version": unit.version,
             "plugin": f"{unit.distribution}:{unit.plugin}",
             "parameters": dict(unit.recorded),
+            "overrides": unit.setting.overrides,
             "seed": unit.seed,
             "horizon": unit.setting.horizon,
             "environment": unit.environment,
@@ -163,6 +176,7 @@ def intervene(
     level: float = 0.05,
     parameters: Mapping[str, Any] | None = None,
     jobs: int | None = None,
+    fresh: bool = False,
     output: str | Path = "oodd-interventions",
     observer: Progress = lambda _done, _total, _text: None,
 ) -> Interventions:
@@ -189,6 +203,8 @@ def intervene(
         As those of `oodd_eval.evaluate`.
     jobs
         Processes; by default one per core.
+    fresh
+        Whether to fit and run again what `output` has already.
     output
         Directory of fits and cells.
     observer
@@ -233,6 +249,9 @@ def intervene(
                 for unit in units
             ]
     with only_writer(study.output):
+        for cell in cells if fresh else ():
+            for file in (cell.file, study.fit_file(cell.unit)):
+                file.unlink(missing_ok=True)
         reasons = _run(cells, jobs, observer)
     done = (cell.read() for cell in cells)
     return Interventions(study.output, [cell for cell in done if cell is not None], reasons)
