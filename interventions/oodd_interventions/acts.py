@@ -1,19 +1,199 @@
-"""temporary"""
+"""Acts of the benchmark's seven environments, and which episodes failed there."""
 
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from oodd_recording.registered import info_of
+
+from oodd_eval import Trajectory
 from oodd_interventions.sensor import VirtualSensor
-from oodd_interventions.situation import ActSpec
+from oodd_interventions.situation import Act, ActSpec, Situation
+
+Row = NDArray[np.float32]
+
+
+def failed(
+    environment: str, rewards: NDArray[np.float32], terminated: bool, cap: int, row: Row
+) -> bool:
+    """Tell whether an episode counts as a failure.
+
+    Parameters
+    ----------
+    environment
+        Its name.
+    rewards : float32 array of shape (T,)
+        Its rewards.
+    terminated
+        Whether the simulator ended it.
+    cap
+        The longest episode, in transitions.
+    row : float32 array of shape (D,)
+        The last row.
+
+    Returns
+    -------
+    bool
+        Whether the simulator ended it before the cap, but for three environments: Acrobot fails
+        when it does not swing up, LunarLander when it crashes or has not come to rest, and
+        HalfCheetah, which the simulator lets go on, when it lies on its back or its nose.
+    """
+    if environment == "acrobot":
+        return not terminated
+    if environment == "lunarlander":
+        return not terminated or bool(rewards[-1] <= -100)
+    if environment == "halfcheetah":
+        return bool(abs(row[7]) >= 1)
+    return terminated and len(rewards) < cap
 
 
 class Mask:
-    def __init__(self, situation):
-        self.situation, self.sensor = situation, VirtualSensor(situation)
+    """The policy goes on, and gets estimates for the sensors that are named."""
 
-    def act(self, row):
-        return self.situation.policy.act(self.sensor.row(row))
+    def __init__(self, situation: Situation) -> None:
+        self._situation, self._sensor = situation, VirtualSensor(situation)
+
+    def act(self, row: Row) -> Any:
+        """Return the policy's command for the estimated row."""
+        return self._situation.policy.act(self._sensor.row(row))
 
 
-ACTS = [ActSpec("mask", Mask, "masks", ("sensor",))]
+class Controller:
+    """Another controller takes over: a function of the row."""
+
+    def __init__(self, command: Callable[[Row], Any], _: Situation | None = None) -> None:
+        self._command = command
+
+    def act(self, row: Row) -> Any:
+        """Return its command for the row."""
+        return self._command(row)
 
 
-def failed(environment, rewards, terminated, cap, row):
-    return bool(terminated)
+def balance(row: Row) -> int:
+    """Balance CartPole by linear feedback of its state."""
+    return int(row @ np.array([0.03, 0.08, 1.0, 0.25]) > 0)
+
+
+def swing(row: Row) -> int:
+    """Pump energy into Acrobot: its torque follows the speed of the joint."""
+    return 2 if row[5] > 0 else 0
+
+
+def land(row: Row) -> int:
+    """Land on the pad: Gymnasium's own heuristic for LunarLander (after Klimov)."""
+    x, y, vx, vy = row[:4].astype(float)
+    return _thrust(row, np.clip(0.5 * x + vx, -0.4, 0.4), 0.5 * (0.55 * abs(x) - y - vy))
+
+
+def descend(row: Row) -> int:
+    """Come down upright and slowly, wherever the lander is."""
+    y, vx, vy = row[1:4].astype(float)
+    return _thrust(row, np.clip(vx, -0.3, 0.3), -0.5 * (min(0.35, 0.1 + 0.2 * max(y, 0)) + vy))
+
+
+def _thrust(row: Row, angle: float, up: float) -> int:
+    """Return the engine that turns LunarLander towards an angle, or pushes it up."""
+    turn = 0.5 * (angle - row[4]) - row[5]
+    if row[6:].any():  # a leg has touched the ground
+        turn, up = 0.0, -0.5 * row[3]
+    if up > max(abs(turn), 0.05):
+        return 2
+    return 1 if turn > 0.05 else 3 if turn < -0.05 else 0
+
+
+def stand(situation: Situation) -> Controller:
+    """Pull all joints of a robot to the middles of their ranges, and brake them."""
+    joints = slice(8, 8 + 2 * situation.actions.shape[1])  # angle and speed of each in turn
+
+    def pull(row: Row) -> Row:
+        angles, speeds = row[joints][::2], row[joints][1::2]
+        return np.clip(-angles - 0.5 * speeds, -1, 1).astype(np.float32)
+
+    return Controller(pull)
+
+
+class Compensated:
+    """The policy goes on, and what pushes its motors is estimated and taken off its commands.
+
+    Errors of the forecasts tell of pushes through the effects that commands have: a disturbance
+    observer (Ohnishi et al. 1996) by Bayesian regression. All motors are pushed alike, and each a
+    little on its own.
+    """
+
+    common, own = 0.3, 0.03
+    """Prior standard deviations of the pushes, in units of the command."""
+    freedom = 4.0
+    """Of the errors' Student t distribution: a contact that comes early tells little."""
+
+    def __init__(self, situation: Situation) -> None:
+        self._situation, model = situation, situation.model
+        d, a = len(model.sensors.mean), len(model.actions.mean)
+        latest, before = model.coefficients[2 * d : 2 * d + a], model.coefficients[-1 - a : -1]
+        self._effects = (latest + before) / model.actions.std[:, None]
+        self._weight = np.linalg.inv(model.covariance)
+        self._precision = np.linalg.inv(self.own**2 * np.eye(a) + self.common**2)
+        self._evidence = np.zeros(a)
+        self._seen = situation.onset
+
+    def act(self, row: Row) -> Row:
+        """Return the policy's command without the push."""
+        situation, model = self._situation, self._situation.model
+        for t in range(max(self._seen, 3), len(situation.rows)):
+            episode = Trajectory(situation.rows[t - 2 : t + 1], situation.actions[t - 2 : t])
+            self._learn(model.errors(episode)[-1])
+        self._seen = len(situation.rows)
+        push = np.linalg.solve(self._precision, self._evidence)
+        low, high = info_of(situation.environment).limits
+        return np.clip(situation.policy.act(row) - push, low, high).astype(np.float32)
+
+    def _learn(self, error: NDArray[np.float64]) -> None:
+        size = error @ self._weight @ error / len(error)
+        told = (self.freedom + 1) / (self.freedom + size) * self._effects @ self._weight
+        self._precision += told @ self._effects.T
+        self._evidence += told @ error
+
+
+ACTS: Final = [
+    ActSpec("mask", Mask, "the policy gets estimates for the named sensors", ("sensor",)),
+    ActSpec("stop", stand, "the robot stands still", ("dynamics",), ("ant", "halfcheetah")),
+    ActSpec(
+        "stop",
+        partial(Controller, descend),
+        "the lander comes down upright where it is",
+        ("dynamics",),
+        ("lunarlander",),
+    ),
+    ActSpec(
+        "switch",
+        partial(Controller, balance),
+        "linear feedback balances the pole",
+        ("dynamics",),
+        ("cartpole",),
+    ),
+    ActSpec(
+        "switch",
+        partial(Controller, swing),
+        "the torque follows the joint's speed",
+        ("dynamics",),
+        ("acrobot",),
+    ),
+    ActSpec(
+        "switch",
+        partial(Controller, land),
+        "Gymnasium's heuristic lands on the pad",
+        ("dynamics",),
+        ("lunarlander",),
+    ),
+    ActSpec(
+        "switch",
+        Compensated,
+        "the push on the motors is estimated and taken off the commands",
+        ("dynamics",),
+        ("ant", "halfcheetah", "hopper", "walker2d"),
+    ),
+]
+"""The acts of the seven."""

@@ -136,6 +136,14 @@ def oodd_anomalies() -> list[AnomalySpec]:
     ]
 
 
+@hookimpl
+def oodd_acts() -> list[Any]:
+    """Offer the acts of the worlds."""
+    from oodd_worlds.acts import ACTS  # noqa: PLC0415  slow to import
+
+    return ACTS
+
+
 def make_oracle(*, seed: int = 0, horizon: int = 1) -> Detector:
     """Return an unfitted oracle of the worlds."""
     from oodd_worlds.oracles import OracleDetector  # noqa: PLC0415  keeps the listing quick
