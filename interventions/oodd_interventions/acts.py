@@ -12,7 +12,7 @@ from oodd_recording.registered import info_of
 
 from oodd_eval import Trajectory
 from oodd_interventions.sensor import VirtualSensor
-from oodd_interventions.situation import Act, ActSpec, Situation
+from oodd_interventions.situation import ActSpec, Situation
 
 Row = NDArray[np.float32]
 
