@@ -18,7 +18,7 @@ MOST_SENSORS: Final = 64
 ROWS: Final = 100
 """Latest rows that a naming looks at: it costs the same however long an episode is."""
 
-Pair: TypeAlias = tuple[NDArray[Any], NDArray[Any] | None]
+_SeenRow: TypeAlias = tuple[NDArray[Any], NDArray[Any] | None]
 """A row, and the action commanded since the one before."""
 
 
@@ -61,7 +61,7 @@ class LatestRowsNamer:
     def reset(self) -> None:
         """Begin a new live episode."""
         self._count = 0
-        self._latest: deque[Pair] = deque(maxlen=ROWS)
+        self._latest: deque[_SeenRow] = deque(maxlen=ROWS)
 
     def update(self, row: NDArray[Any], action: NDArray[Any] | None) -> None:
         """Take the next row and the action commanded since the one before; both are kept."""
@@ -72,7 +72,7 @@ class LatestRowsNamer:
         """Return the parts at fault as seen at the latest `update`, as for the episode so far."""
         return self._named(self._latest, self._count, since)
 
-    def _named(self, latest: Collection[Pair], count: int, since: int) -> Naming | None:
+    def _named(self, latest: Collection[_SeenRow], count: int, since: int) -> Naming | None:
         if self._namer is None:
             return None
         hidden = count - len(latest)
