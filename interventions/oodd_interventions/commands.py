@@ -52,13 +52,15 @@ from oodd_interventions.page import REPORT, sections, write_pages
 @click.option("--fresh", is_flag=True, help="fit and run again what the directory has already")
 @click.option("--output", default="oodd-interventions", type=OUTPUT_DIRECTORY, help="directory")
 def intervene(options: Options) -> int:
-    """Tell what an alarm saves: the simulator goes on from it with an act.
+    """Tell what an alarm saves, by acting on it in the simulator.
 
-    Episodes run again with the same faults. At its alarm an act takes over from the policy, such as
-    one that no longer trusts the sensors that the detector names. The return that this saves stands
-    beside that of acting at once on the true parts, and of acting at another episode's alarm.
+    Faulty episodes run again, and at a detector's alarm an act takes over from the policy. Mask,
+    for example, no longer trusts the sensors that the detector names. The tables say how much of
+    the lost return comes back, beside acting at once on the true parts, and at alarms of other
+    episodes; and what false alarms cost.
 
-    What was done is kept: the same command goes on. The exit code is 1 when a detector failed.
+    The exit code is 1 when a detector failed, and 2 when the study was interrupted. What was done
+    is kept: the same command goes on.
     """
     console, pace = make_console(), Pace(0, time.perf_counter())
     progress = make_console(quiet=options.verbosity < 0)

@@ -53,7 +53,7 @@ def sections(records: Records) -> list[Section]:
     """
     acts = dict.fromkeys(record["act"] for record in records)
     parts = [_of_act(act, [r for r in records if r["act"] == act]) for act in acts]
-    rows = {row_of(r): r for r in _overall(records) if not math.isnan(_value(r, "named_recall"))}
+    rows = {row_of(r): r for r in _overall(records) if not math.isnan(_value(r, "named_precision"))}
     title = "Parts named at the alarm (onset error in rows, the rest in %)"
     named = [_table(title, [*rows.values()], NAMINGS)] * bool(rows)
     notes = ["The return is the sum of an episode's rewards; [95 % intervals] are over seeds."]
