@@ -93,9 +93,9 @@ def _verdict(act: str, best: InterventionRecord) -> str:
     saved = best["intervention"][_SAVED]
     if saved["value"] is None:
         return f"{act} cannot mend these faults: it saves less than 5 % of the nominal return."
-    shown = "" if saved["low"] > max(0.0, _value(best, _PLACEBO)) else "not shown to be "
+    doubt = "" if saved["low"] > max(0.0, _value(best, _PLACEBO)) else "not shown to be "
     return (
-        f"The alarm of {row_of(best)} is {shown}worth having: {act} at the alarm saves "
+        f"The alarm of {row_of(best)} is {doubt}worth having: {act} at the alarm saves "
         f"{_ends(saved)} % of the return that {act} at once, on the true parts, would save; "
         f"at another episode's alarm it saves {_text(best, _PLACEBO)} %, and false alarms cost "
         f"{_text(best, _HARM)} % of a healthy episode's return."
@@ -114,7 +114,7 @@ def _useless(act: str, cells: Records) -> list[Table]:
         ):
             line[name] = COLUMNS[_HARM].text(lost / abs(nominal))
     header = list(dict.fromkeys(name for line in lines.values() for name in line))
-    texts = [[*place, *(line.get(name, "") for name in header)] for place, line in lines.items()]
+    texts = [[*labels, *(line.get(name, "") for name in header)] for labels, line in lines.items()]
     title = f"Faults that {act} cannot mend: their cost, and that of acting (% of nominal return)"
     return [Table(title, ["environment", "anomaly", *header], texts, 2, wrap=True)] * bool(cells)
 
