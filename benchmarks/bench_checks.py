@@ -16,6 +16,7 @@ from oodd_eval.cli.main import main as oodd_eval
 from oodd_eval.data import bounded, layout, stored
 from oodd_eval.plugins import contract, explanations, specs
 from oodd_eval.plugins.isolation import child, supervisor
+from oodd_eval.results import evaluate
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.scoring import plan
 
@@ -28,7 +29,8 @@ CHECKS = {
     plan: ["source_digest"],
     supervisor: ["_value", "_number"],
     contract: ["check_scores"],
-    explanations: ["checked_explanation", "check_named"],
+    explanations: ["checked_explanation"],
+    evaluate: ["check_named"],
     child.Child: ["check", "_judge"],
     ResultsDirectory: ["_opened"],
 }

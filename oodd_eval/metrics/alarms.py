@@ -756,9 +756,10 @@ def naming_contributions(
         Contributions by name, without the suffix of a level.
     """
     faulty = faulty & judged[:, None]
-    named = (namings[..., 1:] > 0) & faulty.any(axis=1)[:, None, None]
-    right = (named & faulty[:, None]).sum(axis=2, dtype=np.float64).T
-    sizes, total = named.sum(axis=2, dtype=np.float64).T, faulty.sum(axis=1, dtype=np.float64)
+    total: Floats = faulty.sum(axis=1, dtype=np.float64)
+    named = (namings[..., 1:] > 0) & (total > 0)[:, None, None]
+    right: Floats = (named & faulty[:, None]).sum(axis=2, dtype=np.float64).T
+    sizes: Floats = named.sum(axis=2, dtype=np.float64).T
     kind = namings[:, 0, 0].tolist()
     hits = np.array([number in of for number, of in zip(kind, kinds, strict=True)], np.float64)
     return {

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import inspect
 import os
-import sys
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ from importlib.metadata import EntryPoint
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
 import pluggy
 
@@ -35,14 +34,7 @@ if TYPE_CHECKING:
     from oodd_eval.data.registry import Spec
 
 
-class _Named(Protocol):
-    """Something that plug-ins offer under a name."""
-
-    @property
-    def name(self) -> str: ...
-
-
-_Spec = TypeVar("_Spec", bound=_Named)
+_Spec = TypeVar("_Spec", bound=Any)  # what plug-ins offer under a name
 
 _BUILT_IN: Final = "trivial"
 RESTRICT: Final = "OODD_EVAL_PLUGINS"
@@ -147,10 +139,11 @@ class Plugin:
     def from_spec(self, text: str) -> DetectorSpec | None:
         """Return the detector for a `maker:name` text, or None if it does not know the maker."""
         spec = self.hook.oodd_detector_from_spec(spec=text)
-        if type(spec) not in (DetectorSpec, type(None)):
-            expected = "None or a DetectorSpec whose name has a colon"
-            raise PluginError(f"{self} made {spec!r:.80} of {text!r}, expected {expected}")
-        return None if spec is None else plain_spec(spec)
+        plain = plain_spec(spec) if type(spec) is DetectorSpec else None
+        if spec is None or (plain and ":" in plain.name):
+            return plain
+        expected = "None or a DetectorSpec whose name has a colon"
+        raise PluginError(f"{self} made {spec!r:.80} of {text!r}, expected {expected}")
 
     def custom_specs(self) -> list[Spec]:
         """Return its environments and anomalies, checked."""
@@ -195,7 +188,7 @@ class Plugins:
         self.broken: list[Broken] = []
         self.notes: list[str] = []
         self.points, self.observer_points = points, observer_points
-        self._load_point, self._waiting = load or _loaded, list(points)
+        self._load_point, self._waiting = load or loaded_plugin, list(points)
         self._observed, self._packages = load is None, tuple(packages)
         self._offers: dict[str, Offer] = {}
         self._forms: dict[str, str] = {}
@@ -373,12 +366,8 @@ class Plugins:
             except BaseException as error:
                 reason = f"failed to make detector {text!r}: {printable(describe(error))}"
                 raise PluginError(f"{name_of(maker.point)} {reason}") from error
-            if spec and ":" in spec.name:
-                return self._offer(maker.point, spec)
             if spec:
-                expected = "None or a DetectorSpec whose name has a colon"
-                reason = f"made {spec.name!r} of {text!r}, expected {expected}"
-                raise PluginError(f"{name_of(maker.point)} {reason}")
+                return self._offer(maker.point, spec)
             asked.append(maker.point.name)
         whom = f"asked {', '.join(asked)}" if asked else "none that is loaded knows such names"
         advice = "oodd-eval list detectors says which names there are"
@@ -425,17 +414,9 @@ def discover(
     return plugins
 
 
-def _loaded(point: EntryPoint) -> Plugin:
+def loaded_plugin(point: EntryPoint) -> Plugin:
+    """Return the plug-in of an entry point, whatever it raises when it is loaded."""
     return Plugin(point, register(point.load()))
-
-
-def plugin_of(distribution: str, name: str, packages: Sequence[Path] = ()) -> Plugin:
-    """Return a loaded plug-in, whatever it raises when it is."""
-    (points,), _ = points_of((hooks.PROJECT,), packages)
-    for point in points:
-        if (point.name, distribution_of(point)) == (name, distribution):
-            return _loaded(point)
-    raise PluginError(f"{distribution} is not installed in the environment of {sys.executable}")
 
 
 def name_of(point: EntryPoint) -> str:

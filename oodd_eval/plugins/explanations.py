@@ -149,15 +149,10 @@ def checked_explanation(returned: Any, trajectory: Trajectory) -> Explanation:
     _check_form("onsets", onsets, f"int64 of shape {(rows,)}")
     undefined = np.isnan(shares).all(axis=1)
     parts = (shares >= 0).all(axis=1) & (np.abs(shares.sum(axis=1) - 1) <= _ROUNDING)
-    valid = (onsets >= 0) & (onsets <= np.arange(rows))
+    valid = np.where(undefined, onsets == -1, (onsets >= 0) & (onsets <= np.arange(rows)))
     for name, array, fine, expected in (
         ("shares", shares, undefined | parts, "parts of 1, or NaN alone where it is undefined"),
-        (
-            "onset",
-            onsets,
-            np.where(undefined, onsets == -1, valid),
-            "a row from 0 to t, or -1 where the shares are NaN",
-        ),
+        ("onset", onsets, valid, "a row from 0 to t, or -1 where the shares are NaN"),
     ):
         if not fine.all():
             t = int(fine.argmin())
@@ -245,20 +240,3 @@ def _check_form(name: str, array: Any, form: str) -> None:
     actual = f"{array.dtype} of shape {array.shape}" if is_array else type(array).__name__
     if actual != form:
         raise ContractError(f"explain returned {name} as {actual}, expected {form}")
-
-
-def check_named(array: object, trajectory: Trajectory, where: str) -> Named:
-    """Return what came from a worker for the last row of an episode; else `ContractError`."""
-    rows, sensors = trajectory.observations.shape
-    form = np.dtype(np.int32), (3 + sensors + trajectory.action_dim,)
-    if not isinstance(array, np.ndarray) or (array.dtype, array.shape) != form:
-        raise ContractError(f"no explanation came back for {where}")
-    sensor, onset, kind, *parts = array.tolist()
-    if kind not in range(-1, len(KINDS)) or not {*parts} <= {0, 1}:
-        raise ContractError(f"no naming came back for {where}")
-    if not (0 <= sensor < sensors and 0 <= onset < rows):
-        raise ContractError(
-            f"explain names sensor {sensor} and onset {onset} at t = {rows - 1} of {where}, where "
-            f"the score is defined: expected one of {sensors} sensors, and a row up to t"
-        )
-    return array

@@ -39,14 +39,8 @@ def parameter(
     scores of the same fit, so that fits are shared over its values, and ``"nothing"`` for what
     changes neither, such as the device that computes: that is no part of a result's identity.
     """
-    facts = {
-        "low": low,
-        "above": above,
-        "high": high,
-        "choices": choices,
-        "decides": decides,
-        "help": help,
-    }
+    bounds = {"low": low, "above": above, "high": high}
+    facts = bounds | {"choices": choices, "decides": decides, "help": help}
     # Dataclasses refuse defaults that all instances would share and could change.
     if isinstance(default, list | dict):
         copies = functools.partial(copy.deepcopy, default)

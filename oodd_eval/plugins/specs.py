@@ -34,9 +34,8 @@ def plain_spec(spec: object) -> DetectorSpec:
     if type(spec) is not DetectorSpec:
         raise PluginError(f"{spec!r:.80} is offered, expected a oodd_eval.DetectorSpec")
     check_detector_spec(spec)
-    declared = None
-    if spec.parameters is not None:
-        declared = declared_as(parameters_of(spec.parameters))
+    of_class = spec.parameters
+    declared = None if of_class is None else declared_as(parameters_of(of_class))
     return replace(spec, requires=tuple(spec.requires), parameters=declared)
 
 
@@ -122,12 +121,8 @@ def is_line(value: object) -> bool:
     return type(value) is str and len(value) <= _LONGEST_LINE and value.isprintable()
 
 
-def _are_lines(value: object) -> bool:
-    return (
-        isinstance(value, tuple | list)
-        and type(value) in (tuple, list)
-        and all(map(is_line, value))
-    )
+def _are_lines(value: Any) -> bool:
+    return type(value) in (tuple, list) and all(map(is_line, value))
 
 
 def _is_truth(value: object) -> bool:

@@ -103,10 +103,9 @@ def _plain(value: object) -> object:
         if wrong := [type(name).__name__ for name in dict.keys(value) if type(name) is not str]:
             raise TypeError(f"a name is {wrong[0]}")
         return {name: _plain(part) for name, part in dict.items(value)}
-    if isinstance(value, list):
-        return [_plain(part) for part in list.__iter__(value)]
-    if isinstance(value, tuple):
-        return [_plain(part) for part in tuple.__iter__(value)]
+    if isinstance(value, list | tuple):
+        parts = list.__iter__(value) if isinstance(value, list) else tuple.__iter__(value)
+        return [_plain(part) for part in parts]
     return value
 
 
@@ -161,7 +160,8 @@ def read_state(path: Path) -> PackedState:
     values = arrays.pop(VALUES, None)
     try:
         text = "" if values is None else values.tobytes().decode()
-        named = isinstance(json.loads(text, parse_constant=_refuse), dict)
+        # No integer is called NaN or Infinity, which are no JSON.
+        named = isinstance(json.loads(text, parse_constant=int), dict)
     except (ValueError, RecursionError):
         named = False
     if not named:
@@ -172,10 +172,6 @@ def read_state(path: Path) -> PackedState:
     if problem := excess(packed):
         raise FittedStateError(f"{str(path)!r} is no saved fit: {problem}")
     return packed
-
-
-def _refuse(constant: str) -> None:
-    raise ValueError(f"{constant} is no JSON")
 
 
 def labelled(kind: str, settings: Mapping[str, Any], arrays: Arrays) -> dict[str, Any]:

@@ -232,8 +232,8 @@ class ResultsDirectory:
         """Keep the scores of a unit, beside parts of it that an earlier run has scored."""
         parts = self._all_parts(key)
         for part, sequences in scores.parts.items():
-            further = (scores.explained, scores.stream, scores.namings)
-            parts[part] = _StoredPart(sequences, *(of.get(part) for of in further))
+            further = scores.explained.get(part), scores.stream.get(part), scores.namings.get(part)
+            parts[part] = _StoredPart(sequences, *further)
         path, digests = self._score_paths(key)
         # In memory: HDF5 crashes where it cannot write, as on a full disk.
         image = io.BytesIO()
@@ -374,11 +374,9 @@ def _namings(part: h5py.Group) -> NDArray[np.int8] | None:
     """Return the named parts of the episodes of a part, which earlier versions did not keep."""
     if NAMINGS not in part:
         return None
-    stored = child(part, NAMINGS, SCORES.error)
-    SCORES.check(NAMINGS, np.dtype(np.float64), stored.nbytes)
-    if stored.dtype != np.int8 or stored.shape[:2] != (len(part["offsets"]) - 1, 3):
-        raise SCORES.error(f"{NAMINGS} are {stored.dtype} of shape {stored.shape}")
-    return np.asarray(stored[:])
+    if part[NAMINGS].dtype != np.int8 or part[NAMINGS].shape[:2] != (len(part["offsets"]) - 1, 3):
+        raise ValueError("namings of another form, or of another number of episodes than scores")
+    return np.asarray(part[NAMINGS][:])
 
 
 class RecordWriter:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import islice
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,13 +26,14 @@ from oodd_eval.metrics import alarms, unpaired
 from oodd_eval.metrics.alarms import AlarmKind, Calibration, GuaranteedAlarm
 from oodd_eval.metrics.auc import AlarmRule, Contribution, auc_before, cell_contributions
 from oodd_eval.metrics.bootstrap import drawn_cell, mean_interval
-from oodd_eval.metrics.catalogue import HEADLINE, LEVELS, metric_info
+from oodd_eval.metrics.catalogue import HEADLINE, LEVELS, NAMED_AFTER, metric_info
 from oodd_eval.metrics.cusum import Standardization
 from oodd_eval.metrics.faults import StreamScale, readings
 from oodd_eval.metrics.recalibration import Draws, PairedScores, Recalibration
 from oodd_eval.metrics.unpaired import UnpairedScores
 from oodd_eval.plugins.contract import ROLLOUT_TOLERANCE, TOLERANCE, Scores
-from oodd_eval.plugins.explanations import KINDS
+from oodd_eval.plugins.explanations import KINDS, Named
+from oodd_eval.plugins.forecasting import FeatureScale
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
 from oodd_eval.results.identity import Cell
 from oodd_eval.results.record import NAN, CodedDraws, Metric, Record
@@ -118,6 +119,74 @@ def first_alarms(
     rule = Rules.fit(parts[CALIBRATION], alarm).guaranteed.get(HEADLINE)
     tests = {part: of_part for part, of_part in parts.items() if part not in (CALIBRATION, TWINS)}
     return {part: [rule.first(x) if rule else None for x in xs] for part, xs in tests.items()}
+
+
+class Asked(NamedTuple):
+    """A question to a detector that explains: its episode, which one after an alarm, and rows."""
+
+    part: str
+    number: int
+    later: int
+    rows: int
+
+
+def with_explanations(
+    parts: dict[str, list[Scores]],
+    asked: Iterable[tuple[Asked, Trajectory, object]],
+    data: EnvironmentData,
+    scale: FeatureScale,
+) -> ScoreFile:
+    """Return scores of a unit beside explanations, which came back unchecked.
+
+    Parameters
+    ----------
+    parts
+        Scores of episodes with twins, by part.
+    asked
+        Questions, the rows that these were of, and what came back.
+    data
+        The environment.
+    scale
+        Of the training episodes, by which the largest readings are found.
+
+    Returns
+    -------
+    ScoreFile
+
+    Raises
+    ------
+    ContractError
+        When something came back that is no explanation.
+    """
+    tests = {part: rows for part, rows in parts.items() if part not in (CALIBRATION, TWINS)}
+    first = {part: [np.full((2, len(x)), -1, np.int32) for x in xs] for part, xs in tests.items()}
+    shape = 1 + len(NAMED_AFTER), 1 + len(data.sensors) + len(data.actions)
+    namings = {part: np.zeros((len(xs), *shape), np.int8) for part, xs in tests.items()}
+    for (part, i, later, rows), x, array in asked:
+        named = check_named(array, x, f"{data.id}/{part}[{i}]")
+        namings[part][i, later, : len(named) - 2] = named[2:]
+        if not later:
+            first[part][i][:, rows - 1] = named[:2]
+            largest = np.argsort(-np.abs(scale(x)[-1]), kind="stable")
+            namings[part][i, -1, 1 + largest[: named[3:].sum()]] = 1
+    return ScoreFile(parts, {}, first, namings=namings)
+
+
+def check_named(array: object, trajectory: Trajectory, where: str) -> Named:
+    """Return what came from a worker for the last row of an episode; else `ContractError`."""
+    rows, sensors = trajectory.observations.shape
+    form = np.dtype(np.int32), (3 + sensors + trajectory.action_dim,)
+    if not isinstance(array, np.ndarray) or (array.dtype, array.shape) != form:
+        raise ContractError(f"no explanation came back for {where}")
+    sensor, onset, kind, *named = array.tolist()
+    if kind not in range(-1, len(KINDS)) or not {*named} <= {0, 1}:
+        raise ContractError(f"no naming came back for {where}")
+    if not (0 <= sensor < sensors and 0 <= onset < rows):
+        raise ContractError(
+            f"explain names sensor {sensor} and onset {onset} at t = {rows - 1} of {where}, where "
+            f"the score is defined: expected one of {sensors} sensors, and a row up to t"
+        )
+    return array
 
 
 def largest_of(stream: Mapping[str, Sequence[Scores]]) -> list[float] | None:

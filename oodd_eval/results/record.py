@@ -28,7 +28,6 @@ from pydantic import (
     TypeAdapter,
     ValidationError,
 )
-from pydantic_core import core_schema
 
 from oodd_eval._version import __version__
 from oodd_eval.data.bounded import without_nan
@@ -128,13 +127,8 @@ def _coded(draws: Floats) -> tuple[float, str]:
     return step, _LETTERS[CENTRE + codes].tobytes().decode()
 
 
-def _schema(_: Any, handler: Any) -> core_schema.CoreSchema:
-    return core_schema.no_info_after_validator_function(
-        CodedDraws.read, handler(dict[str, tuple[float, str]])
-    )
-
-
-Draws = Annotated[CodedDraws, GetPydanticSchema(_schema)]
+_Coded = Annotated[dict[str, tuple[float, str]], AfterValidator(CodedDraws.read)]
+Draws = Annotated[CodedDraws, GetPydanticSchema(lambda _, read: read(_Coded))]
 """A record's draws: read from an object of pairs of a number and a text."""
 
 SCHEMA: Final = 3

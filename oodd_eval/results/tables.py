@@ -452,8 +452,9 @@ _NOMINAL: Final = ("false_episodes", "false_alarms_per_hour")
 _PUBLISHED: Final = "Metrics of rows, for comparison with published tables; they rank nothing"
 _ATTRIBUTION: Final = (
     "Of the detectors that explain their scores, at the first guaranteed alarm: how often the "
-    "sensor that they name first is a corrupted one, over sensor anomalies, and how far the onset "
-    "that they name is from the effect, the median of a cell."
+    "sensor that they name first is a corrupted one, over sensor anomalies, how far the onset that "
+    "they name is from the effect, the median of a cell, and how well the named parts are those at "
+    "fault, pooled over episodes, beside chance and the largest readings."
 )
 
 CENSORED: Final = "Delay censored counts a miss as the whole remainder of its episode."

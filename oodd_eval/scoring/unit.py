@@ -12,32 +12,23 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from oodd_eval.data.baseline import Baseline, check_baseline
-from oodd_eval.data.parts import (
-    CALIBRATION,
-    TWINS,
-    EnvironmentData,
-    TrajectorySet,
-    lengths_of,
-    parts_of,
-)
+from oodd_eval.data.parts import CALIBRATION, EnvironmentData, TrajectorySet, lengths_of, parts_of
 from oodd_eval.data.trajectory import Trajectory, TrajectorySequence
 from oodd_eval.errors import ContractError, OutputError, ResultsError, SplitError, UsageError
 from oodd_eval.metrics.catalogue import NAMED_AFTER
 from oodd_eval.plugins import contract, explanations
 from oodd_eval.plugins.contract import Progress, ignore_progress
 from oodd_eval.plugins.discovery import Offer, describe, printable
-from oodd_eval.plugins.explanations import Named
 from oodd_eval.plugins.forecasting import FeatureScale
 from oodd_eval.plugins.isolation.child import Launcher, Limits, Stop
 from oodd_eval.plugins.isolation.supervisor import Outcome, run_isolated
 from oodd_eval.plugins.state import PackedState
 from oodd_eval.plugins.voices import costs_of_voices, first_rows
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
-from oodd_eval.results.evaluate import first_alarms
+from oodd_eval.results.evaluate import Asked, first_alarms, with_explanations
 from oodd_eval.results.record import Status
 from oodd_eval.scoring.plan import Plan, Unit
 
-_NOMINAL: Final = (CALIBRATION, TWINS)
 LEAST_GROUP: Final = 8
 """Trajectories of a group where test parts differ in size: each group takes a process."""
 
@@ -174,8 +165,7 @@ class GroupedScoring:
         self._groups = mixed(sizes) if job.streamed else groups(sizes)
         # Metrics with twins alone are of explanations, and there are no baseline rows then.
         self._explains = job.data.paired and not rows and not job.streamed
-        # Of what is explained: the episode, which time after its alarm, and the rows until then.
-        self._asked: list[tuple[Member, int, int]] = []
+        self._asked: list[Asked] = []
         # What voices are compared on, and how.
         calibration = (Member(CALIBRATION, i) for i in range(sizes[CALIBRATION]))
         self._heard = first_rows(self._members(calibration))
@@ -301,7 +291,7 @@ class GroupedScoring:
         self._asked = []
         for group in self._groups:
             asked = [
-                (Member(part, i), later, min(first + 1 + rows, self._lengths[part][i]))
+                Asked(part, i, later, min(first + 1 + rows, self._lengths[part][i]))
                 for later, rows in enumerate(NAMED_AFTER)
                 for part, i in group
                 if part in firsts and (first := firsts[part][i]) is not None
@@ -310,10 +300,9 @@ class GroupedScoring:
                 self._asked += asked
                 yield map(self._asked_rows, asked)
 
-    def _asked_rows(self, asked: tuple[Member, int, int]) -> Trajectory:
+    def _asked_rows(self, asked: Asked) -> Trajectory:
         """Return the rows of an episode that an explanation is asked of."""
-        (x,) = self._members(asked[:1])
-        return x[: asked[2]]
+        return self._visible(self._sets[asked.part][asked.number])[: asked.rows]
 
     def _members(self, group: Iterable[Member]) -> Iterator[Trajectory]:
         return (self._visible(self._sets[part][i]) for part, i in group)
@@ -331,23 +320,9 @@ class GroupedScoring:
         parts = self._checked(scores, warm_up)
         if explained is None or not self._explains:
             return ScoreFile(self._whole(parts), {})
-        named: dict[str, list[Named]] = {
-            part: [np.full((2, len(rows)), -1, np.int32) for rows in sequences]
-            for part, sequences in parts.items()
-            if part not in _NOMINAL
-        }
-        data, scale = self._job.data, FeatureScale.fit(self._train)
-        shape = 1 + len(NAMED_AFTER), 1 + len(data.sensors) + len(data.actions)
-        namings = {part: np.zeros((len(rows), *shape), np.int8) for part, rows in named.items()}
-        for asked, array in zip(self._asked, explained, strict=True):
-            ((part, i), later, rows), x = asked, self._asked_rows(asked)
-            checked = explanations.check_named(array, x, f"{data.id}/{part}[{i}]")
-            namings[part][i, later, : len(checked) - 2] = checked[2:]
-            if not later:
-                named[part][i][:, rows - 1] = checked[:2]
-                largest = np.argsort(-np.abs(scale(x)[-1]), kind="stable")
-                namings[part][i, -1, 1 + largest[: checked[3:].sum()]] = 1
-        return ScoreFile(parts, {}, named, namings=namings)
+        asked = zip(self._asked, map(self._asked_rows, self._asked), explained, strict=True)
+        data = self._job.data
+        return with_explanations(parts, asked, data, FeatureScale.fit(self._train))
 
     def _checked(
         self, scores: Sequence[object], warm_up: object

@@ -17,9 +17,9 @@ from oodd_eval.metrics.alarms import (
 from oodd_eval.metrics.auc import mean_of
 from oodd_eval.metrics.bootstrap import bootstrap_weights, resampled
 from oodd_eval.metrics.catalogue import ATTRIBUTION
-from oodd_eval.plugins.explanations import check_named, explain_chunk, explains
+from oodd_eval.plugins.explanations import explain_chunk, explains
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
-from oodd_eval.results.evaluate import rescore, stored_scores
+from oodd_eval.results.evaluate import check_named, rescore, stored_scores
 
 NAN = float("nan")
 SENSOR_NAMED, ONSET_ERROR, PRECISION, RECALL, _, _, CHANCE, LARGEST, KIND_NAMED = ATTRIBUTION

@@ -37,10 +37,14 @@ def test_the_names_of_a_level_are_those_of_its_metrics_their_nulls_and_the_thres
     expected = ["false_episodes", *(n for name in own for n in (name, f"{name}_null"))]
     expected += ["events_found", "false_alarms_per_hour", "found_outcome", "found_outcome_null"]
     assert list(GUARANTEED) == expected
+    sets = [f"named_{of}{after}" for after in ("", "_20") for of in ("precision", "recall")]
+    named = ["sensor_named", "onset_error", *sets, "named_chance", "named_largest", "kind_named"]
     assert {n for n in NAMES if n.endswith("_at_5pct")} == {
-        f"{name}_at_5pct" for name in [*expected, "threshold", "sensor_named", "onset_error"]
+        f"{name}_at_5pct" for name in [*expected, "threshold", *named]
     }
-    assert list(ATTRIBUTION) == ["sensor_named_at_5pct", "onset_error_at_5pct"]
+    assert list(ATTRIBUTION) == [f"{name}_at_5pct" for name in named]
+    assert metric_info("named_precision_at_5pct").null == "named_chance_at_5pct"
+    assert metric_info("named_recall_at_5pct").null == "named_largest_at_5pct"
     assert [n for n in NAMES if metric_info(n).median] == ["onset_error_at_5pct"]
 
 
@@ -62,13 +66,16 @@ def test_other_names_are_refused(name):
         metric_info(name)
 
 
+_BESIDE = ("null", "placebo", "threshold", "before", "chance", "largest")
+
+
 def test_better_sides():
     """Nulls and their like describe a benchmark or a setting; the others rank rows."""
     for name in NAMES:
-        beside = any(word in name for word in ("null", "placebo", "threshold", "before"))
+        beside = any(word in name for word in _BESIDE)
         assert bool(metric_info(name).better) != beside, name
     found = [n for n in NAMES if n.startswith("found") and "null" not in n]
-    for name in ("auc", RANKING, "sensor_named_at_5pct", *found):
+    for name in ("auc", RANKING, "sensor_named_at_5pct", "named_recall_20_at_5pct", *found):
         assert metric_info(name).better == "higher"
     for name in (ALARM_RANKING, "far", "missed", "onset_error_at_5pct"):
         assert metric_info(name).better == "lower"

@@ -80,14 +80,6 @@ class _Session:
         return report
 
 
-def _fixtures(trial: Trial) -> ModuleType:
-    """Return a pytest plug-in that gives the tests their detector."""
-    # A module: pytest deprecates fixtures of instances that last longer than a test.
-    fixtures = ModuleType("oodd_eval_detector")
-    vars(fixtures)["detector"] = pytest.fixture(scope="session", name="detector")(lambda: trial)
-    return fixtures
-
-
 def _name(item: pytest.Item) -> str:
     return item.name.removeprefix("test_").replace("_", "-")
 
@@ -98,10 +90,12 @@ def run_tests(
     """Run tests in this process and call `listener` with each result."""
     if not __debug__:
         raise UsageError("checks of detectors are assertions: run them without python -O")
+    # A module: pytest deprecates fixtures of instances that last longer than a test.
+    fixtures = ModuleType("oodd_eval_detector")
+    vars(fixtures)["detector"] = pytest.fixture(scope="session", name="detector")(lambda: trial)
+    plugins = [_Session(checks, listener), fixtures]
     with patch.dict(os.environ, _VARIABLES):
-        code = pytest.main(
-            [*_OPTIONS, str(test_detector.__file__)], [_Session(checks, listener), _fixtures(trial)]
-        )
+        code = pytest.main([*_OPTIONS, str(test_detector.__file__)], plugins)
     if code == pytest.ExitCode.INTERRUPTED:
         raise KeyboardInterrupt
     if code not in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED):

@@ -95,12 +95,8 @@ class Project:
             "@ADVICE@": _ADVICE,
         }
         if address:
-            names |= {
-                "@PROJECT@": f"[oodd-eval]({address})",
-                "@SOURCE@": f'"oodd-eval @ git+{address}"',
-                "@CONDITION@": "",
-                "@ADVICE@": "",
-            }
+            names |= {"@PROJECT@": f"[oodd-eval]({address})", "@CONDITION@": "", "@ADVICE@": ""}
+            names["@SOURCE@"] = f'"oodd-eval @ git+{address}"'
         templates = files(__name__) / "templates"
 
         def fill(text: str) -> str:

@@ -24,11 +24,12 @@ from oodd_eval.plugins.discovery import (
     describe,
     discover,
     distribution_of,
-    plugin_of,
+    loaded_plugin,
     printable,
     register,
     staying,
 )
+from oodd_eval.plugins.installed import points_of
 from oodd_eval.plugins.isolation import ChannelClosedError, ChannelGarbledError
 from oodd_eval.plugins.isolation.child import Child, GivenUpError, Launcher, Limits
 from oodd_eval.plugins.isolation.worker import connect
@@ -175,6 +176,15 @@ def _answer(plugin: Plugin, text: str) -> Answer:
     return {"spec": spec and description_of(spec)}
 
 
+def _plugin_of(distribution: str, name: str, packages: Sequence[Path] = ()) -> Plugin:
+    """Return a loaded plug-in, whatever it raises when it is."""
+    (points,), _ = points_of((PROJECT,), packages)
+    for point in points:
+        if (point.name, distribution_of(point)) == (name, distribution):
+            return loaded_plugin(point)
+    raise PluginError(f"{distribution} is not installed in the environment of {sys.executable}")
+
+
 def main(arguments: Sequence[str]) -> NoReturn:
     """Load the plug-ins of a distribution, tell what they offer, and end."""
     channel, packages = connect(arguments)
@@ -182,7 +192,7 @@ def main(arguments: Sequence[str]) -> NoReturn:
     for name in request["plugins"]:
         try:
             with staying():
-                plugin = plugin_of(request["distribution"], name, packages)
+                plugin = _plugin_of(request["distribution"], name, packages)
                 answers[name] = _answer(plugin, request["make"])
         except BaseException as error:  # noqa: BLE001  foreign code may raise anything
             answers[name] = {"broken": printable(describe(error))}

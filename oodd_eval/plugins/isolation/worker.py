@@ -188,9 +188,8 @@ def _obey(channel: Channel, detector: Detector) -> None:
 def _detector(request: dict[str, Any], packages: Sequence[Path]) -> Detector:
     gc.disable()  # collecting would take a tenth of the time in which PyTorch is imported
     spec = offer_of(request["plugin"], request["detector"], packages).spec
-    arguments = {name: request[name] for name in ("seed", "horizon", "parameters")}
-    declared = {name: request[name] for name in ("baseline", "roles") if name in request}
-    detector = make_detector(spec.factory, **arguments, **declared)
+    names = {"seed", "horizon", "parameters", "baseline", "roles"} & request.keys()
+    detector = make_detector(spec.factory, **{name: request[name] for name in names})
     gc.enable()
     return detector
 
