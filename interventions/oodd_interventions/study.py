@@ -32,7 +32,6 @@ from oodd_recording.policies import load_policy
 from oodd_recording.registered import info_of
 
 from oodd_eval.data import layout
-from oodd_eval.data.condition import Condition
 from oodd_eval.data.facts import Group, SplitDefinition
 from oodd_eval.data.files import only_writer, write_text
 from oodd_eval.data.parts import EnvironmentData
@@ -46,17 +45,22 @@ from oodd_eval.plugins.contract import StorableDetector
 from oodd_eval.plugins.discovery import Plugins, describe, discover
 from oodd_eval.plugins.state import pack, read_state, write_state
 from oodd_eval.prose import terminal_text
-from oodd_eval.results.record import gather
+from oodd_eval.results.record import Record, gather
 from oodd_eval.scoring.plan import Unit, make_plan
 from oodd_interventions.acts import ACTS
 from oodd_interventions.columns import InterventionRecord, records_of
-from oodd_interventions.loop import FittedDetector, Loop, Pair, oracle_arms, run_cell
+from oodd_interventions.loop import FittedDetector, Loop, LoopArm, LoopPair, run_cell
 from oodd_interventions.page import sections
 from oodd_interventions.situation import ActSpec
 
 DETECTOR: Final = "detector."
 """Prefix of a detector's arrays in the file of its fit."""
 SCHEMA: Final = "oodd-eval/intervention/1"
+IDENTITY: Final = (
+    *("detector", "detector_version", "plugin", "plugin_source", "parameters", "overrides"),
+    *("seed", "horizon", "environment", "group", "split", "split_digest"),
+)
+"""Fields of a record that say what a cell is of."""
 BASE: Final = 680
 """Seeds of a study are this number in millions, and those after it: no split's, by default."""
 
@@ -109,58 +113,35 @@ class Study:
 
 @dataclass(frozen=True, slots=True)
 class StudyCell:
-    """A detector in an environment, a condition and an act."""
+    """A detector in an environment, a condition and an act; `record` says which."""
 
     study: Study
     unit: Unit
-    condition: Condition
-    strength: float | None
-    group: Group
+    record: Record
     act: ActSpec
-
-    @property
-    def name(self) -> str:
-        """Its name in reasons."""
-        return f"{name_of(self.unit)}/{self.condition}--{self.act.name}"
 
     @property
     def file(self) -> Path:
         """Its file, which is whole or absent."""
         directory = self.study.output / "cells" / self.unit.environment / _plain_name(self.unit)
-        return directory / f"{self.condition}--{self.act.name}.json"
+        return directory / f"{self.record.condition}--{self.act.name}.json"
 
     def identity(self) -> dict[str, Any]:
         """Return what it is of, as JSON has it."""
-        split, unit = load_split(self.study.split), self.unit
-        definition = _definition(split, unit.environment)
-        identity = {
-            "schema": SCHEMA,
-            "detector": unit.setting.detector,
-            "detector_version": unit.version,
-            "plugin": f"{unit.distribution}:{unit.plugin}",
-            "parameters": dict(unit.recorded),
-            "overrides": unit.setting.overrides,
-            "seed": unit.seed,
-            "horizon": unit.setting.horizon,
-            "environment": unit.environment,
-            "anomaly": str(self.condition),
-            "group": self.group,
-            "split": split.name,
-            "split_digest": split.digest,
-            "act": self.act.name,
-            "level": self.study.level,
-            "base": self.study.base,
-            "cap": definition.episode_cap or info_of(unit.environment).episode_cap,
-        }
+        environment, study = self.unit.environment, self.study
+        cap = _definition(study.split, environment).episode_cap or info_of(environment).episode_cap
+        identity = {name: getattr(self.record, name) for name in IDENTITY}
+        identity |= {"schema": SCHEMA, "anomaly": str(self.record.condition), "cap": cap}
+        identity |= {"act": self.act.name, "level": study.level, "base": study.base}
         plain: dict[str, Any] = json.loads(json.dumps(identity))
         return plain
 
     def read(self) -> dict[str, Any] | None:
         """Return the cell that an earlier study of the same wrote; None without one."""
-        with suppress(OSError, ValueError, KeyError, TypeError):
+        with suppress(OSError, ValueError, TypeError):
             cell: dict[str, Any] = json.loads(self.file.read_text(encoding="utf-8"))
-            same = cell | self.identity() == cell and len(cell["episodes"]) == self.study.seeds
-            return cell if same and cell["provenance"]["source"] == self.unit.source else None
+            if cell | self.identity() == cell and len(cell["episodes"]) == self.study.seeds:
+                return cell
         return None
 
 
@@ -180,7 +161,7 @@ def intervene(
     output: str | Path = "oodd-interventions",
     observer: Progress = lambda _done, _total, _text: None,
 ) -> Interventions:
-    """Run the closed loop with acts at alarms: what do the detectors' alarms save?
+    """Run the closed loop with acts at alarms: what detectors' alarms save.
 
     Cells that are in `output` already are taken from there.
 
@@ -236,18 +217,12 @@ def intervene(
     offered = offered_acts(plugins)
     act_names = select("act", _listed(acts or "all"), dict.fromkeys(act.name for act in offered))
     study = Study(opened.path, Path(output), seeds, base, level)
-    cells = []
-    for environment in environment_names:
-        units = [unit for unit in plan.units if unit.environment == environment]
-        for condition in units[0].conditions if units else ():
-            group = plan.groups[condition.anomaly]
-            strength = plan.strengths[environment].get(condition)
-            suited = suiting(offered, act_names, environment, group)
-            cells += [
-                StudyCell(study, unit, condition, strength, group, act)
-                for act in suited
-                for unit in units
-            ]
+    cells = [
+        StudyCell(study, unit, plan.blank(unit, condition, status="ok"), act)
+        for unit in plan.units
+        for condition in unit.conditions
+        for act in suiting(offered, act_names, unit.environment, plan.groups[condition.anomaly])
+    ]
     with only_writer(study.output):
         for cell in cells if fresh else ():
             for file in (cell.file, study.fit_file(cell.unit)):
@@ -273,36 +248,31 @@ def suiting(
     """Return the named acts that suit: of one name the last one that is the environment's own."""
     suited = [act for act in acts if act.name in names and group in act.groups]
     general = {act.name: act for act in suited if not act.environments}
-    own = {act.name: act for act in suited if environment in act.environments}
-    return tuple((general | own).values())
+    special = {act.name: act for act in suited if environment in act.environments}
+    return tuple((general | special).values())
 
 
 def _run(cells: Sequence[StudyCell], jobs: int | None, observer: Progress) -> dict[str, str]:
     """Fit detectors, then run the cells that are missing; return why some could not be run."""
     missing = [cell for cell in cells if cell.read() is None]
     done, reasons = len(cells) - len(missing), dict[str, str]()
-    if not missing:
-        return reasons
     with workers(jobs) as pool:
         try:
-            units = {name_of(cell.unit): cell for cell in missing}
-            fits = {pool.submit(fit, cell.study, cell.unit): name for name, cell in units.items()}
+            units = {_name_of(cell.unit): (cell.study, cell.unit) for cell in missing}
+            fits = {pool.submit(fit, *units[name]): name for name in units}
             for future in as_completed(fits):
                 reasons |= _failure(future, fits[future])
                 observer(done, len(cells), f"{fits[future]} fitted")
-            missing = [cell for cell in missing if name_of(cell.unit) not in reasons]
-            groups = itertools.groupby(
-                missing, lambda cell: (cell.unit.environment, cell.condition)
-            )
-            tasks = {
-                pool.submit(run_cells, batch): batch for batch in map(list, (g for _, g in groups))
-            }
+            batches: dict[str, list[StudyCell]] = {}
+            for cell in missing:
+                if _name_of(cell.unit) not in reasons:
+                    shared = f"{cell.unit.environment}/{cell.record.condition}"
+                    batches.setdefault(shared, []).append(cell)
+            tasks = {pool.submit(run_cells, batch): name for name, batch in batches.items()}
             for future in as_completed(tasks):
-                batch = tasks[future]
-                name = f"{batch[0].unit.environment}/{batch[0].condition}"
-                reasons |= _failure(future, name) or future.result()
-                done += len(batch)
-                observer(done, len(cells), name)
+                reasons |= _failure(future, tasks[future]) or future.result()
+                done += len(batches[tasks[future]])
+                observer(done, len(cells), tasks[future])
         except BaseException:  # an interrupt, too, does not wait for what is running now
             pool.shutdown(wait=False, cancel_futures=True)
             raise
@@ -312,11 +282,9 @@ def _run(cells: Sequence[StudyCell], jobs: int | None, observer: Progress) -> di
 def _failure(future: Future[Any], name: str) -> dict[str, str]:
     """Return why something in a process failed, by its name; nothing where it did not."""
     error = future.exception()
-    if error is None:
-        return {}
-    if not isinstance(error, Exception) or isinstance(error, BrokenProcessPool):
+    if isinstance(error, BrokenProcessPool):
         raise error
-    return {name: describe(error)}
+    return {name: describe(error)} if error else {}
 
 
 def fit(study: Study, unit: Unit) -> None:
@@ -371,7 +339,7 @@ def _data(split: Path, environment: str) -> EnvironmentData:
 @functools.cache
 def _loop(split: Path, environment: str) -> Loop:
     """Return policy, noise and cap of a split's environment, and a model of its readings."""
-    definition = _definition(load_split(split), environment)
+    definition = _definition(split, environment)
     policy = load_policy(environment)
     setup = Setup(environment, policy, definition.episode_cap, definition.noise)
     return Loop(setup, ReadingModel.fit(list(_data(split, environment).train)))
@@ -395,33 +363,31 @@ def _twins(study: Study, environment: str) -> list[RecordedEpisode]:
 
 def run_cells(cells: Sequence[StudyCell]) -> dict[str, str]:
     """Run cells of one environment and condition, with shared arms; return why some failed."""
-    study, unit, condition = cells[0].study, cells[0].unit, cells[0].condition
-    loop, reasons = _loop(study.split, unit.environment), dict[str, str]()
-    pairs = []
-    for twin in _twins(study, unit.environment):
-        drawn = (condition.anomaly, cells[0].strength)
-        never = record_anomalous(loop.setup, *drawn, twin)
-        pairs.append(Pair(*drawn, cells[0].group, twin, never))
-    for _, same in itertools.groupby(cells, lambda cell: cell.act.name):
-        of_act = list(same)
-        oracles = oracle_arms(loop, pairs, of_act[0].act)
-        for cell in of_act:
-            start = time.perf_counter()
-            try:
-                file = study.fit_file(cell.unit)
-                if file not in _detectors:
-                    _detectors[file] = _restored(study, cell.unit)
-                outcome = run_cell(loop, pairs, oracles, cell.act, _detectors[file])
-            except Exception as error:  # noqa: BLE001  of foreign code
-                reasons[cell.name] = describe(error)
-                continue
-            facts = {"provenance": gather() | {"source": cell.unit.source}}
-            facts["seconds"] = round(time.perf_counter() - start, 3)
-            write_text(cell.file, json.dumps(cell.identity() | facts | outcome))
+    study, unit, record = cells[0].study, cells[0].unit, cells[0].record
+    loop, fault = _loop(study.split, unit.environment), (record.anomaly, record.magnitude)
+    pairs = [
+        LoopPair(*fault, record.group, twin, record_anomalous(loop.setup, *fault, twin))
+        for twin in _twins(study, unit.environment)
+    ]
+    oracles: dict[str, list[LoopArm]] = {}
+    reasons: dict[str, str] = {}
+    for cell in cells:
+        start, act, file = time.perf_counter(), cell.act, study.fit_file(cell.unit)
+        try:
+            if act.name not in oracles:
+                oracles[act.name] = [loop.oracle(pair, act) for pair in pairs]
+            if file not in _detectors:
+                _detectors[file] = _restored(study, cell.unit)
+            outcome = run_cell(loop, pairs, oracles[act.name], act, _detectors[file])
+        except Exception as error:  # noqa: BLE001  of foreign code
+            reasons[f"{_name_of(cell.unit)}/{record.condition}--{act.name}"] = describe(error)
+            continue
+        facts = {"provenance": gather(), "seconds": round(time.perf_counter() - start, 3)}
+        write_text(cell.file, json.dumps(cell.identity() | facts | outcome))
     return reasons
 
 
-def name_of(unit: Unit) -> str:
+def _name_of(unit: Unit) -> str:
     """Return the name of a detector in an environment, in reasons."""
     return f"{unit.environment}/{unit.setting.detector}"
 
@@ -431,8 +397,9 @@ def _plain_name(unit: Unit) -> str:
     return unit.setting.detector.replace(":", "-")
 
 
-def _definition(split: Split, environment: str) -> SplitDefinition:
-    return SplitDefinition(**split.manifest["definition"]).of(environment)
+def _definition(split: Path, environment: str) -> SplitDefinition:
+    """Return what a split's environment was recorded with."""
+    return SplitDefinition(**load_split(split).manifest["definition"]).of(environment)
 
 
 def _check_recorded(split: Split, environment: str, base: int) -> None:
@@ -442,8 +409,8 @@ def _check_recorded(split: Split, environment: str, base: int) -> None:
             f"{environment} of split {split.name} was imported from logs: an intervention needs a "
             "simulator, expected a split that was recorded"
         )
-    if base == _definition(split, environment).seed_base:
-        raise UsageError(f"base={base} is that of split {split.name}: expected seeds of its own")
+    if base == _definition(split.path, environment).seed_base:
+        raise UsageError(f"base={base} is that of split {split.name}: expected another one")
 
 
 def _listed(names: Names) -> str:
