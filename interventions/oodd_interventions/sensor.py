@@ -25,8 +25,8 @@ EARLIER: Final = 10
 """Rows before the onset at which estimates begin: an onset that is found late spoils them all."""
 FARTHEST: Final = 10.0
 """Largest distance from the mean that a value may have, in training standard deviations."""
-LARGEST: Final = 1e6
-"""Largest variance of a value, standardized."""
+LARGEST: Final = 1e4
+"""Largest size of a fault, and variance of an estimate, standardized."""
 NAMED: Final = 0.5
 """Least probability of a sensor that is named."""
 
@@ -98,8 +98,7 @@ class VirtualSensor:
         variances = np.full(len(naming.sensors), TRUSTED)
         sizes = naming.sizes[named] / self._situation.model.sensors.std[named]
         # A size that is not known says as little as a reading that says nothing.
-        known = np.isfinite(sizes)
-        variances[named] = np.where(known, np.minimum(np.nan_to_num(sizes) ** 2, LARGEST), np.inf)
+        variances[named] = np.where(np.isfinite(sizes), np.minimum(sizes, LARGEST) ** 2, np.inf)
         self._read = np.flatnonzero(np.isfinite(variances))
         self._noise = np.diag(np.maximum(variances[self._read], TRUSTED))
         # Values of the named sensors now and one row before, and their covariance.
