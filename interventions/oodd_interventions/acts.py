@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from oodd_recording.policies import Policy, load_policy
 from oodd_recording.registered import info_of
 
 from oodd_eval import Trajectory
@@ -15,6 +17,9 @@ from oodd_interventions.sensor import VirtualSensor
 from oodd_interventions.situation import ActSpec, Situation
 
 Row = NDArray[np.float32]
+
+STANDING: Final = Path(__file__).with_name("standing")
+"""Directory of policies that stand: linear, learnt under pushes and with weaker motors."""
 
 
 def failed(
@@ -78,11 +83,6 @@ def balance(row: Row) -> int:
     return int(row @ np.array([0.03, 0.08, 1.0, 0.25]) > 0)
 
 
-def swing(row: Row) -> int:
-    """Pump energy into Acrobot: its torque follows the speed of the joint."""
-    return 2 if row[5] > 0 else 0
-
-
 def land(row: Row) -> int:
     """Land on the pad: Gymnasium's own heuristic for LunarLander (after Klimov)."""
     x, y, vx, vy = row[:4].astype(float)
@@ -105,7 +105,7 @@ def _thrust(row: Row, angle: float, up: float) -> int:
     return 1 if turn > 0.05 else 3 if turn < -0.05 else 0
 
 
-def stand(situation: Situation) -> Controller:
+def brace(situation: Situation) -> Controller:
     """Pull all joints of a robot to the middles of their ranges, and brake them."""
     joints = slice(8, 8 + 2 * situation.actions.shape[1])  # angle and speed of each in turn
 
@@ -114,6 +114,11 @@ def stand(situation: Situation) -> Controller:
         return np.clip(-angles - 0.5 * speeds, -1, 1).astype(np.float32)
 
     return Controller(pull)
+
+
+def stand(situation: Situation) -> Policy:
+    """Let a policy take over that has learnt to brake and to stand."""
+    return load_policy(situation.environment, STANDING / f"{situation.environment}.npz")
 
 
 class Compensated:
@@ -126,6 +131,8 @@ class Compensated:
 
     common, own = 0.3, 0.03
     """Prior standard deviations of the pushes, in units of the command."""
+    least = 0.1
+    """A smaller push is left alone: weaker motors and heavier bodies look like one."""
     freedom = 4.0
     """Of the errors' Student t distribution: a contact that comes early tells little."""
 
@@ -147,6 +154,7 @@ class Compensated:
             self._learn(model.errors(episode)[-1])
         self._seen = len(situation.rows)
         push = np.linalg.solve(self._precision, self._evidence)
+        push[np.abs(push) < self.least] = 0.0
         low, high = info_of(situation.environment).limits
         return np.clip(situation.policy.act(row) - push, low, high).astype(np.float32)
 
@@ -161,6 +169,9 @@ ACTS: Final = [
     ActSpec("mask", Mask, "the policy gets estimates for the named sensors", ("sensor",)),
     ActSpec("stop", stand, "the robot stands still", ("dynamics",), ("ant", "halfcheetah")),
     ActSpec(
+        "stop", stand, "a policy that has learnt to stand takes over", ("dynamics",), ("hopper",)
+    ),
+    ActSpec(
         "stop",
         partial(Controller, descend),
         "the lander comes down upright where it is",
@@ -173,13 +184,6 @@ ACTS: Final = [
         "linear feedback balances the pole",
         ("dynamics",),
         ("cartpole",),
-    ),
-    ActSpec(
-        "switch",
-        partial(Controller, swing),
-        "the torque follows the joint's speed",
-        ("dynamics",),
-        ("acrobot",),
     ),
     ActSpec(
         "switch",
