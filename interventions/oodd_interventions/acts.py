@@ -14,7 +14,7 @@ from oodd_recording.registered import info_of
 
 from oodd_eval import Trajectory
 from oodd_interventions.sensor import VirtualSensor
-from oodd_interventions.situation import ActSpec, Situation
+from oodd_interventions.situation import Act, ActSpec, Situation
 
 Row = NDArray[np.float32]
 
@@ -165,39 +165,20 @@ class Compensated:
         self._evidence += told @ error
 
 
+def _of(name: str, make: Callable[[Situation], Act], summary: str, *names: str) -> ActSpec:
+    """Return an act for faults of the dynamics in named environments."""
+    return ActSpec(name, make, summary, ("dynamics",), names)
+
+
+_ROBOTS: Final = ("ant", "halfcheetah", "hopper", "walker2d")
+
 ACTS: Final = [
     ActSpec("mask", Mask, "the policy gets estimates for the named sensors", ("sensor",)),
-    ActSpec("stop", stand, "the robot stands still", ("dynamics",), ("ant", "halfcheetah")),
-    ActSpec(
-        "stop", stand, "a policy that has learnt to stand takes over", ("dynamics",), ("hopper",)
-    ),
-    ActSpec(
-        "stop",
-        partial(Controller, descend),
-        "the lander comes down upright where it is",
-        ("dynamics",),
-        ("lunarlander",),
-    ),
-    ActSpec(
-        "switch",
-        partial(Controller, balance),
-        "linear feedback balances the pole",
-        ("dynamics",),
-        ("cartpole",),
-    ),
-    ActSpec(
-        "switch",
-        partial(Controller, land),
-        "Gymnasium's heuristic lands on the pad",
-        ("dynamics",),
-        ("lunarlander",),
-    ),
-    ActSpec(
-        "switch",
-        Compensated,
-        "the push on the motors is estimated and taken off the commands",
-        ("dynamics",),
-        ("ant", "halfcheetah", "hopper", "walker2d"),
-    ),
+    _of("stop", brace, "the joints go to the middles of their ranges", "ant", "halfcheetah"),
+    _of("stop", stand, "a policy that has learnt to stand takes over", "hopper"),
+    _of("stop", partial(Controller, descend), "the lander comes down where it is", "lunarlander"),
+    _of("switch", partial(Controller, balance), "linear feedback balances the pole", "cartpole"),
+    _of("switch", partial(Controller, land), "Gymnasium's heuristic lands it", "lunarlander"),
+    _of("switch", Compensated, "a push on the motors is estimated and taken off", *_ROBOTS),
 ]
 """The acts of the seven."""

@@ -6,10 +6,8 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from oodd_interventions.situation import ActSpec, Situation
+from oodd_interventions.situation import Act, ActSpec, Situation
 from oodd_recording.policies import Policy
-
-from oodd_eval.data.facts import Group
 
 Row = NDArray[np.float32]
 
@@ -86,28 +84,17 @@ def stiffen(factor: float, situation: Situation) -> Shown:
     return Shown(situation.policy, change)
 
 
-_DYNAMICS: Final[tuple[Group, ...]] = ("dynamics",)
+def _of(name: str, make: Callable[[Situation], Act], summary: str, world: str) -> ActSpec:
+    """Return an act for faults of the dynamics in a world."""
+    return ActSpec(name, make, summary, ("dynamics",), (world,))
+
 
 ACTS: Final = [
-    ActSpec("stop", hold, "the arm holds its angles", _DYNAMICS, ("arm",)),
-    ActSpec("stop", land, "the drone comes down where it is", _DYNAMICS, ("drone",)),
-    ActSpec("stop", drain, "levels go to fail-safe set points", _DYNAMICS, ("tank",)),
-    ActSpec(
-        "switch",
-        partial(integral, ARM_WAY, 4.0),
-        "the controller gets an integral",
-        _DYNAMICS,
-        ("arm",),
-    ),
-    ActSpec(
-        "switch",
-        partial(integral, DRONE_WAY, 1.0),
-        "the controller gets an integral",
-        _DYNAMICS,
-        ("drone",),
-    ),
-    ActSpec(
-        "switch", partial(stiffen, 1.5), "the controller gets higher gains", _DYNAMICS, ("tank",)
-    ),
+    _of("stop", hold, "the arm holds its angles", "arm"),
+    _of("stop", land, "the drone comes down where it is", "drone"),
+    _of("stop", drain, "levels go to fail-safe set points", "tank"),
+    _of("switch", partial(integral, ARM_WAY, 4.0), "the controller gets an integral", "arm"),
+    _of("switch", partial(integral, DRONE_WAY, 1.0), "the controller gets an integral", "drone"),
+    _of("switch", partial(stiffen, 1.5), "the controllers get higher gains", "tank"),
 ]
 """The acts of the worlds."""
