@@ -8,15 +8,15 @@ neighbours whose forecasts it spoils.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Final, NamedTuple, Self
+from typing import Any, Final, NamedTuple, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_common.charts import Floats
+from oodd_common.charts import Floats, limited
 from oodd_common.windows import StandardEpisode, regressors
 from oodd_eval import Naming, Trajectory
 from oodd_eval.plugins.forecasting import CONSTANT, FeatureScale
@@ -24,34 +24,22 @@ from oodd_eval.plugins.state import Arrays, take
 
 ORDER: Final = 2
 """Latest rows, and commands, that a forecast uses."""
-RIDGE: Final = 1e-4
-"""Penalty of the forecast, relative to the mean square of a standardized sensor."""
-FOLDS: Final = 5
-"""Parts of the episodes, each forecast by what was fitted on the others."""
-FLOOR: Final = 3e-3
-"""Least standard deviation of a forecast's error, in training standard deviations."""
-FREEDOM: Final = 4.0
-"""Degrees of freedom of the errors' Student t distribution: contacts make their tails heavy."""
-STEPS: Final = 10
-"""Steps in which the errors' covariance is found."""
-WINDOW: Final = 6
-"""Rows from the onset on that a naming looks at."""
-SIZES: Final = np.array([0.03, 0.1, 0.3, 1.0, 3.0])
-"""Sizes of faults that are tried, in training standard deviations."""
-LARGEST: Final = 0.4
-"""Largest share of the sensors that is named as a set."""
-LEAST: Final = 2.0
-"""Least evidence, in natural logarithms, for which a further sensor is named."""
-SHARE: Final = 0.4
-"""Price of a sensor as a share of the 99 % quantile of its evidence in nominal windows."""
-DISTINCT: Final = 8
-"""A sensor with as few values in training is never named: it tells contacts or modes."""
-STEP: Final = 2.0
-"""Limit of the logarithm of a row's error in the CUSUM that finds the onset."""
-NOMINAL: Final = 400
-"""Nominal windows that prices are learnt from, at most."""
+RIDGE: Final = 1e-6  # relative to the mean square of a standardized sensor
+FOLDS: Final = 5  # of episodes, each forecast by what was fitted on the others
+FLOOR: Final = 3e-3  # least standard deviation of an error, in those of training
+FREEDOM: Final = 4.0  # of the errors' Student t distribution: contacts make heavy tails
+STEPS: Final = 10  # in which the errors' covariance is found
+STEP: Final = 2.0  # limit of an error's logarithm in the CUSUM that finds the onset
+LIMIT: Final = 100.0  # of a reading that a fault is proportional to, in standard deviations
+WINDOW: Final = 8  # rows from the onset on that a naming looks at
+SIZES: Final = np.array([0.03, 0.1, 0.3, 1.0, 3.0])  # of faults, in standard deviations
+LARGEST: Final = 0.4  # share of the sensors in a set
+DISTINCT: Final = 8  # a sensor with as few values tells contacts or modes: it is never named
+
+# Prices in nats of evidence.
+PRICE: Final = 2.0  # of a part
+FIRST: Final = 2.5  # of a set, times the logarithm of the number of sensors: the best is of many
 NEVER: Final = 1e9
-"""Price of a sensor that is never named."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,37 +67,32 @@ class ReadingModel:
         return cls.with_errors(nominal)[0]
 
     @classmethod
-    def with_errors(cls, nominal: Sequence[Trajectory]) -> tuple[Self, list[Floats]]:
-        """Return a fit, and the errors of forecasts that were fitted to other episodes, (T, D)."""
-        sensors, actions = (
-            _scale([x.observations for x in nominal]),
-            _scale([x.actions for x in nominal]),
-        )
+    def with_errors(cls, nominal: Sequence[Trajectory]) -> tuple[Self, Floats]:
+        """Return a fit, and the errors of forecasts that were fitted to other episodes, (N, D)."""
+        sensors = _scale([x.observations for x in nominal])
+        actions = _scale([x.actions for x in nominal])
         bare = cls(sensors, actions, np.empty((0, 0)), np.empty((0, 0)))
         pairs = [(bare.regressors(x), bare.standard(x)[1:]) for x in nominal]
         fits = [
             _ridge([pair for j, pair in enumerate(pairs) if j % FOLDS != i] or pairs)
             for i in range(min(FOLDS, len(pairs)))
         ]
-        errors = [y - x @ fits[i % FOLDS] for i, (x, y) in enumerate(pairs)]
-        return cls(sensors, actions, _ridge(pairs), _covariance(np.concatenate(errors))), errors
+        errors = np.concatenate([y - x @ fits[i % FOLDS] for i, (x, y) in enumerate(pairs)])
+        return cls(sensors, actions, _ridge(pairs), _covariance(errors)), errors
 
     def standard(self, x: Trajectory) -> Floats:
         """Return the standardized rows of an episode, (T + 1, D)."""
-        standard: Floats = (x.observations - self.sensors.mean) / self.sensors.std
-        return standard
+        return np.asarray((x.observations - self.sensors.mean) / self.sensors.std)
 
     def regressors(self, x: Trajectory) -> Floats:
         """Return what forecasts of the rows 1 to T are made of, (T, K)."""
-        commands = (x.actions - self.actions.mean) / self.actions.std
-        if not len(self.actions.mean):
-            commands = np.empty((x.transitions, 0))
+        known = x.actions if len(self.actions.mean) else x.actions[:, :0]
+        commands = (known - self.actions.mean) / self.actions.std
         return regressors(StandardEpisode(self.standard(x), commands), 1, ORDER)
 
     def errors(self, x: Trajectory) -> Floats:
         """Return the errors of the forecasts of the rows 1 to T, standardized: (T, D)."""
-        errors: Floats = self.standard(x)[1:] - self.regressors(x) @ self.coefficients
-        return errors
+        return np.asarray(self.standard(x)[1:] - self.regressors(x) @ self.coefficients)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,15 +102,16 @@ class PartNamer:
     A reading is the state and, of faulty sensors, something more, f. The error of a row is then the
     nominal one, plus f, minus what the f of the two rows before brought into the forecast. The
     evidence of a set is the density of the errors of some rows with normal f, divided by that
-    without a fault. Parts join the set as long as they are worth their price.
+    without a fault. An unknown scale of all errors, which makes both Student's t, keeps contacts
+    and other dynamics from being called sensors. A faulty actuator adds to errors alone.
 
     Attributes
     ----------
     model
         How readings follow from earlier ones in nominal operation.
     price : float64 array of shape (D + A,)
-        Evidence, in natural logarithms, for which a sensor or actuator is named; `NEVER` for
-        sensors that have few values.
+        Evidence, in natural logarithms, for which a sensor or actuator joins a set. `NEVER` for
+        sensors that have few values, and for columns of actions that are choices.
     runs : float64 array of shape (2, D)
         Longest runs in training of readings that are exactly 0, and that equal the one before.
     reference
@@ -143,23 +127,15 @@ class PartNamer:
     def fit(cls, nominal: Sequence[Trajectory]) -> Self:
         """Fit to nominal episodes; actions are used where episodes have them."""
         model, errors = ReadingModel.with_errors(nominal)
-        values = [len(np.unique(x)) for x in np.concatenate([x.observations for x in nominal]).T]
+        lengths = _squares(errors, np.linalg.inv(model.covariance))
+        reference = float(np.sqrt(np.quantile(lengths, 0.9))) or 1.0
+        rows = np.concatenate([x.observations for x in nominal])
+        actions = np.concatenate([x.actions for x in nominal])
+        choices = ((actions == 0) | (actions == 1)).all() and (actions.sum(axis=1) == 1).all()
+        coarse = [len(np.unique(sensor)) <= DISTINCT for sensor in rows.T]
+        price = np.where(coarse + [choices] * actions.shape[1], NEVER, PRICE)
         runs = np.max([_longest(x.observations) for x in nominal], axis=0)
-        precision = np.linalg.inv(model.covariance)
-        rows = np.concatenate(errors)
-        lengths = np.sqrt(((rows @ precision) * rows).sum(axis=1))
-        d, a = len(values), len(model.actions.mean)
-        free = cls(model, np.zeros(d + a), runs, float(np.quantile(lengths, 0.9)) or 1.0)
-        windows = [
-            (e[i : i + n], shapes[:, i : i + n])
-            for e, x in zip(errors, nominal, strict=True)
-            for shapes in [free.shapes(x)]
-            for i, n in zip(range(0, len(e), WINDOW), itertools.cycle([1, WINDOW]))
-        ]
-        gains = [free.alone(*w) for w in windows[:: -(-len(windows) // NOMINAL)]]
-        price = np.maximum(LEAST, SHARE * np.quantile(gains, 0.99, axis=0))
-        price[:d][np.array(values) <= DISTINCT] = NEVER
-        return cls(model, price, runs, free.reference)
+        return cls(model, price, runs, reference)
 
     def name(self, x: Trajectory, since: int | None = None) -> tuple[Naming, int]:
         """Name the parts at fault as seen at the last row of an episode.
@@ -206,40 +182,20 @@ class PartNamer:
         actions = FeatureScale.of(arrays, "naming_actions")
         d, a = len(sensors.mean), len(actions.mean)
         coefficients = take(arrays, "naming_coefficients", (ORDER * (d + a) + 1, d))
-        covariance = take(arrays, "naming_covariance", (d, d))
-        reference = take(arrays, "naming_reference", (1,), "+")
-        return cls(
-            ReadingModel(sensors, actions, coefficients, covariance),
-            take(arrays, "naming_price", (d + a,)),
-            take(arrays, "naming_runs", (2, d)),
-            float(reference[0]),
+        model = ReadingModel(
+            sensors, actions, coefficients, take(arrays, "naming_covariance", (d, d))
         )
-
-    @cached_property
-    def precision(self) -> Floats:
-        """Inverse of the covariance of one row's errors, (D, D)."""
-        return np.asarray(np.linalg.inv(self.model.covariance))
+        price, runs = take(arrays, "naming_price", (d + a,)), take(arrays, "naming_runs", (2, d))
+        return cls(model, price, runs, float(take(arrays, "naming_reference", (1,), "+")[0]))
 
     @cached_property
     def evidence(self) -> tuple[_Evidence, _Evidence]:
         """Evidence of faulty sensors, and of faulty actuators."""
-        d, a = len(self.model.sensors.mean), len(self.model.actions.mean)
+        d, precision = len(self.model.covariance), np.linalg.inv(self.model.covariance)
         readings = self.model.coefficients[: ORDER * d].reshape(ORDER, d, d)
-        commands = self.model.coefficients[ORDER * d : -1].reshape(ORDER, a, d)
-        lags = np.concatenate([np.eye(d)[None], -readings]).transpose(0, 2, 1)
-        sensors = _Evidence(lags, self.precision)
-        return sensors, _Evidence(commands.transpose(0, 2, 1), self.precision)
-
-    def shapes(self, x: Trajectory) -> Floats:
-        """Return readings and commands about 0, in their standard deviations, (D + A, T)."""
-        readings = x.observations[1:] / self.model.sensors.std
-        return np.concatenate([readings, x.actions / self.model.actions.std], axis=1).T
-
-    def alone(self, errors: Floats, shapes: Floats) -> Floats:
-        """Return the evidence of each part alone in some rows, (D + A,)."""
-        d = errors.shape[1]
-        parts = zip(self.evidence, (shapes[:d], shapes[d:]), strict=True)
-        return np.concatenate([e.alone(errors, shape) for e, shape in parts])
+        commands = self.model.coefficients[ORDER * d : -1].reshape(ORDER, -1, d)
+        lags = np.concatenate([np.eye(d)[None], -readings])
+        return _Evidence(lags, precision), _Evidence(commands, precision)
 
 
 class LiveNaming:
@@ -247,193 +203,174 @@ class LiveNaming:
 
     def __init__(self, namer: PartNamer, since: int) -> None:
         self._namer, self._since, self._t = namer, since, -1
-        self._runs = np.zeros_like(namer.runs)
-        self._sum, self._onset = 0.0, 0
-        self._errors: list[Floats] = []
-        self._shapes: list[Floats] = []
+        self._runs, self._sum, self._onset = np.zeros_like(namer.runs), 0.0, 0
+        self._window: list[tuple[Floats, Floats]] = []
+        self._precision = namer.evidence[0].precision
 
     def update(self, row: NDArray[Any], action: NDArray[Any] | None = None) -> None:
         """Take the next row, (D,), and the action commanded since the one before, (A,)."""
-        model = self._namer.model
-        self._t += 1
-        values = np.asarray(row, dtype=np.float64)
-        standard = (values - model.sensors.mean) / model.sensors.std
+        model, values = self._namer.model, np.array(row, dtype=np.float64)
+        self._t, standard = self._t + 1, (values - model.sensors.mean) / model.sensors.std
         if not self._t:
-            self._last, self._runs[0] = values, values == 0
-            self._rows = [standard] * ORDER
+            self._last, self._rows = values, [standard] * ORDER
             self._commands = [np.zeros(len(model.actions.mean))] * ORDER
             return
-        command = np.asarray(action, dtype=np.float64) if len(model.actions.mean) else np.empty(0)
+        command = np.array(action, dtype=np.float64) if len(model.actions.mean) else np.empty(0)
         self._commands = [(command - model.actions.mean) / model.actions.std, *self._commands[:-1]]
+        forecast = np.concatenate([*self._rows, *self._commands, [1.0]]) @ model.coefficients
+        shape = np.concatenate([values / model.sensors.std, command / model.actions.std])
+        self._follow(standard - forecast, limited(shape, LIMIT))
         self._runs = np.where([values == 0, values == self._last], self._runs + 1, 0)
-        error = (
-            standard - np.concatenate([*self._rows, *self._commands, [1.0]]) @ model.coefficients
-        )
-        self._follow(
-            error, np.concatenate([values / model.sensors.std, command / model.actions.std])
-        )
         self._last, self._rows = values, [standard, *self._rows[:-1]]
 
     def _follow(self, error: Floats, shape: Floats) -> None:
         """Find the onset with a CUSUM, and keep the first rows from there on."""
-        length = np.sqrt(error @ self._namer.precision @ error) / self._namer.reference
         if self._sum <= 0 or self._t <= self._since:
-            self._sum, self._onset, self._errors, self._shapes = 0.0, self._t, [], []
+            self._sum, self._onset, self._window = 0.0, self._t, []
+        length = np.sqrt(_squares(error[None], self._precision)[0]) / self._namer.reference
         self._sum += float(np.clip(np.log(np.maximum(length, 1e-9)), -STEP, STEP))
-        if len(self._errors) < WINDOW:
-            self._errors.append(error)
-            self._shapes.append(shape)
+        if len(self._window) < WINDOW:
+            self._window.append((error, shape))
 
     def name(self) -> tuple[Naming, int]:
         """Name the parts at fault as seen at the latest row, and the onset."""
-        namer, (d, a) = self._namer, (len(self._namer.runs[0]), len(self._namer.model.actions.mean))
-        sensors, actuators, sizes = np.zeros(d), np.zeros(a), np.full(d, np.nan)
-        silent = (self._runs > namer.runs + np.array([[0], [1]])).any(axis=0) & (
-            namer.price[:d] < NEVER
-        )
-        if silent.any():
-            sensors[silent], sizes[silent] = 1.0, np.inf
-            return Naming(sensors, actuators, sizes, "sensor"), self._onset
-        if not self._errors:
-            return Naming(sensors, actuators, sizes), self._onset
-        errors, shapes = np.stack(self._errors), np.stack(self._shapes, axis=1)
-        readings, commands = namer.evidence
-        most = max(1, int(LARGEST * d))
-        of_sensors = readings.best(errors, shapes[:d], namer.price[:d], most)
-        of_actuators = commands.best(errors, shapes[d:], namer.price[d:], min(a, 1))
-        if of_sensors.value <= 0 and of_actuators.value <= 0:
-            return Naming(sensors, actuators, sizes, "body"), self._onset
-        if of_actuators.value > of_sensors.value:
-            return Naming(sensors, of_actuators.probability, sizes, "actuator"), self._onset
-        sizes = of_sensors.sizes * namer.model.sensors.std
-        return Naming(of_sensors.probability, actuators, sizes, "sensor"), self._onset
+        namer, onset, d = self._namer, self._onset, len(self._precision)
+        sensors, actuators = np.zeros(d), np.zeros(len(namer.price) - d)
+        sizes, kind, varies = np.full(d, np.nan), "", namer.price[:d] < NEVER
+        rests = (self._runs > namer.runs + np.array([[0], [1]])) & varies
+        if rests.any():
+            # Those that came to rest in the same row do so for the same reason.
+            length = np.where(rests, self._runs, -1).max(axis=1, keepdims=True)
+            rests = (rests | ((self._runs == length) & varies)).any(axis=0)
+            sensors, sizes, kind = rests * 1.0, np.where(rests, np.inf, np.nan), "sensor"
+            onset = self._t + 1 - int(length.max())
+        elif self._window:
+            errors, shapes = (np.stack(list(arrays)) for arrays in zip(*self._window, strict=True))
+            most, price = max(1, int(LARGEST * d)), namer.price
+            readings = namer.evidence[0].best(errors, shapes[:, :d], price[:d], most)
+            commands = namer.evidence[1].best(errors, shapes[:, d:], price[d:], len(actuators))
+            if max(readings[0], commands[0]) <= FIRST * np.log(1 + d):
+                kind = "body"
+            elif readings[0] >= commands[0]:
+                (_, sensors, sizes), kind = readings, "sensor"
+            elif (commands[1] >= 0.5).sum() > 1:
+                kind = "environment"  # such as wind, which moves all joints
+            else:
+                actuators, kind = commands[1], "actuator"
+        return Naming(sensors, actuators, sizes * namer.model.sensors.std, kind), onset
 
 
-class _Set(NamedTuple):
-    """The best set: its evidence beyond prices, and of each part probability and size, (P,)."""
-
-    value: float
-    probability: Floats
-    sizes: Floats
+_Set: TypeAlias = tuple[float, Floats, Floats]
+"""A set of parts: its evidence beyond prices, and each part's probability and size, (P,)."""
 
 
 class _Evidence:
     """Evidence of sets of parts in the errors of some rows.
 
-    A fault of size 1 in part p at row t adds ``lags[a, :, p]`` to the error of row t + a.
+    A fault of size 1 in part p at row t adds ``lags[a, p]`` to the error of row t + a.
     """
 
-    def __init__(self, lags: Floats, precision: Floats) -> None:
-        self._weighted = lags.transpose(0, 2, 1) @ precision  # (L, P, D)
-        self._products = np.einsum("apd,bdq->abpq", self._weighted, lags)
+    def __init__(self, lags: Floats, precision: NDArray[Any]) -> None:
+        self.precision, self._weighted = precision, lags @ precision  # (L, P, D)
+        self._products = np.einsum("apd,bqd->abpq", self._weighted, lags)
 
-    def _problems(self, errors: Floats, shape: Floats) -> Iterator[tuple[Floats, Floats]]:
-        """Yield H'Q⁻¹H and H'Q⁻¹r of faults that are like `shape`, constant, and free."""
-        rows, parts = len(errors), len(shape)
+    def best(self, errors: Floats, shapes: Floats, price: Floats, most: int) -> _Set:
+        """Return the best set of at most so many parts.
+
+        Faults are like `shapes`, (N, P), or constant, or free in each row.
+        """
+        (rows, parts), lags = shapes.shape, len(self._weighted)
         gram, pull = np.zeros((parts, rows, parts, rows)), np.zeros((parts, rows))
-        for k, a in np.ndindex(rows, len(self._weighted)):
-            if k >= a:
+        for k, a in np.ndindex(rows, lags):
+            if a <= k:
                 pull[:, k - a] += self._weighted[a] @ errors[k]
-                for b in range(min(len(self._weighted), k + 1)):
+                for b in range(min(lags, k + 1)):
                     gram[:, k - a, :, k - b] += self._products[a, b]
-        for form in (shape, np.ones_like(shape)):
-            small = np.einsum("piqj,pi,qj->pq", gram, form, form, optimize=True)
-            yield small[:, None, :, None], (form * pull).sum(axis=1)[:, None]
-        if rows > 1:
-            yield gram, pull
-
-    def alone(self, errors: Floats, shape: Floats) -> Floats:
-        """Return the evidence of each part alone, (P,)."""
-        values = [_worth(_own_blocks(g), p[None]) for g, p in self._problems(errors, shape)]
-        best: Floats = np.max([value.max(axis=0) for value in values], axis=0)
-        return best
-
-    def best(self, errors: Floats, shape: Floats, price: Floats, most: int) -> _Set:
-        """Return the best set of at most so many parts."""
-        none = _Set(0.0, np.zeros(len(price)), np.full(len(price), np.nan))
-        sets = (_search(g, p, price, most) for g, p in self._problems(errors, shape) if most)
-        return max([none, *sets], key=lambda found: found.value)
+        square = float(_squares(errors, self.precision).sum())
+        free, sets = np.tile(np.eye(rows), (parts, 1, 1)), []
+        for form in (shapes.T[:, None], np.ones((parts, 1, rows)), free):
+            blocks = np.einsum("pai,piqj,qbj->paqb", form, gram, form, optimize=True)
+            pulls = np.einsum("pai,pi->pa", form, pull)
+            sets.append(_Search(blocks, pulls, form, price, square, errors.size).best(most))
+        return max(sets, key=lambda found: found[0])
 
 
-def _own_blocks(gram: Floats) -> Floats:
-    """Return the blocks of the parts themselves for all sizes, (S, P, K, K)."""
-    every = np.arange(len(gram))
-    return np.tile(gram[every, :, every], (len(SIZES), 1, 1, 1))
+class _Search(NamedTuple):
+    """A search for the best set of faults, each a sum of K rows of its part's `form`, (P, K, N)."""
 
+    gram: Floats
+    pull: Floats
+    form: Floats
+    price: Floats
+    square: float
+    number: int
 
-def _worth(blocks: Floats, pulls: Floats) -> Floats:
-    """Return the evidence of each part for each size, (S, P), of blocks and pulls (S, P, K)."""
-    k = pulls.shape[-1]
-    precision = blocks + np.eye(k) / SIZES[:, None, None, None] ** 2
-    squares = (
-        pulls * np.linalg.solve(precision, pulls[..., None] + 0 * blocks[..., :1])[..., 0]
-    ).sum(-1)
-    spread = np.linalg.slogdet(precision)[1] + 2 * k * np.log(SIZES)[:, None]
-    return np.asarray(0.5 * (squares - spread))
+    def density(self, square: Any) -> Any:
+        """Return Student's log density of all errors, as far as the square of their length says."""
+        return -0.5 * (FREEDOM + self.number) * np.log(FREEDOM + np.maximum(square, 0.0))
 
+    def best(self, most: int) -> _Set:
+        """Return the best set, whose parts join one by one, for all sizes of faults at once.
 
-def _search(gram: Floats, pull: Floats, price: Floats, most: int) -> _Set:
-    """Return the best set, whose parts join one by one, for all sizes of faults at once.
+        The columns of the Cholesky factor of the set's precision tell what is left for the others.
+        """
+        (parts, k), every, sizes = self.pull.shape, np.arange(len(SIZES)), SIZES[:, None, None]
+        prior = np.eye(k) / sizes[..., None] ** 2
+        blocks = np.einsum("pipj->pij", self.gram)[None].repeat(len(SIZES), axis=0)
+        pulls, columns = np.tile(self.pull, (len(SIZES), 1, 1)), list[Floats]()
+        joined, value = np.zeros((len(SIZES), parts), dtype=bool), np.zeros(len(SIZES))
+        square, found = np.full((len(SIZES), 1), self.square), (-np.inf, every[:0], value, 1.0)
+        for step in range(most + 1):
+            root = np.linalg.inv(np.linalg.cholesky(blocks + prior))
+            seen = (root @ pulls[..., None])[..., 0]
+            squares, scales = (seen**2).sum(axis=2), np.einsum("spkk->spk", root)
+            cost = self.price - np.log(scales / sizes).sum(axis=2)
+            worth = self.density(square - squares) - self.density(square) - cost
+            g = int(value.argmax())
+            if value[g] > found[0]:
+                found = float(value[g]), np.flatnonzero(joined[g]), worth[g], float(SIZES[g])
+            if step == most:
+                break
+            part = np.where(joined, -np.inf, 0.5 * squares - cost).argmax(axis=1)
+            value, square = value + worth[every, part], square - squares[every, part][:, None]
+            joined[every, part] = True
+            column = self.gram[:, :, part].transpose(2, 0, 1, 3)
+            for earlier in columns:
+                column = column - earlier @ earlier[every, part].transpose(0, 2, 1)[:, None]
+            columns.append(column @ root[every, part].transpose(0, 2, 1)[:, None])
+            pulls = pulls - (columns[-1] @ seen[every, part][:, None, :, None])[..., 0]
+            blocks = blocks - columns[-1] @ columns[-1].transpose(0, 1, 3, 2)
+        return self._judged(*found)
 
-    The columns of the Cholesky factor of the set's precision tell what is left for the others.
-    """
-    every, blocks = np.arange(len(SIZES)), _own_blocks(gram)
-    pulls, columns = np.tile(pull, (len(SIZES), 1, 1)), np.empty((0, *blocks.shape))
-    joined, value = np.zeros(pulls.shape[:2], dtype=bool), np.zeros(len(SIZES))
-    for step in range(most + 1):
-        worth = _worth(blocks, pulls) - price
-        net = np.where(joined, -np.inf, worth)
-        part = net.argmax(axis=1)
-        grows = net[every, part] > 0
-        if step == most or not grows.any():
-            break
-        value += np.where(grows, net[every, part], 0.0)
-        joined[every, part] |= grows
-        precision = blocks[every, part] + np.eye(pull.shape[1]) / SIZES[:, None, None] ** 2
-        root = np.linalg.inv(np.linalg.cholesky(precision)) * grows[:, None, None]
-        column = gram[:, :, part].transpose(2, 0, 1, 3)
-        for earlier in columns:
-            column = column - earlier @ earlier[every, part].transpose(0, 2, 1)[:, None]
-        column = column @ root.transpose(0, 2, 1)[:, None]
-        pulls = pulls - (column @ (root @ pulls[every, part][..., None])[:, None])[..., 0]
-        blocks = blocks - column @ column.transpose(0, 1, 3, 2)
-        columns = np.concatenate([columns, column[None]])
-    g = int(value.argmax())
-    return _judged(gram, pull, price, worth[g], joined[g], g, float(value[g]))
-
-
-def _judged(
-    gram: Floats,
-    pull: Floats,
-    price: Floats,
-    worth: Floats,
-    joined: NDArray[np.bool_],
-    g: int,
-    value: float,
-) -> _Set:
-    """Return a set with what each part is worth beside the others, and the sizes of its faults."""
-    members, sizes, k = np.flatnonzero(joined), np.full(len(pull), np.nan), pull.shape[1]
-    worth = np.minimum(worth, -1e-6)
-    if len(members):
-        precision = gram[members][:, :, members].reshape(len(members) * k, -1)
-        posterior = np.linalg.inv(precision + np.eye(len(precision)) / SIZES[g] ** 2)
-        mean = (posterior @ pull[members].ravel()).reshape(-1, k)
-        blocks = posterior.reshape(len(members), k, len(members), k)
-        blocks = blocks[np.arange(len(members)), :, np.arange(len(members))]
+    def _judged(self, value: float, members: NDArray[Any], worth: Floats, size: float) -> _Set:
+        """Return a set with what each member is worth beside the others, and its size."""
+        (_, k), count, every = self.pull.shape, len(members), np.arange(len(members))
+        worth, sizes = np.minimum(worth, -1e-6), np.full(len(worth), np.nan)
+        precision = self.gram[members][:, :, members].reshape(count * k, count * k)
+        posterior = np.linalg.inv(precision + np.eye(count * k) / size**2)
+        mean = (posterior @ self.pull[members].ravel()).reshape(count, k)
+        blocks = posterior.reshape(count, k, count, k)[every, :, every]
         squares = (mean * np.linalg.solve(blocks, mean[..., None])[..., 0]).sum(axis=1)
-        spread = np.linalg.slogdet(blocks)[1] - 2 * k * np.log(SIZES[g])
-        worth[members] = 0.5 * (squares + spread) - price[members]
-        sizes[members] = np.sqrt((mean**2 + np.einsum("mkk->mk", blocks)).mean(axis=1))
-    return _Set(value, 1 / (1 + np.exp(-np.clip(worth, -50, 50))), sizes)
+        left = self.square - (mean * self.pull[members]).sum()
+        worth[members] = self.density(left) - self.density(left + squares) - self.price[members]
+        worth[members] += 0.5 * np.linalg.slogdet(blocks)[1] - k * np.log(size)
+        moments, form = mean[:, :, None] * mean[:, None] + blocks, self.form[members]
+        sizes[members] = np.sqrt(np.einsum("mab,mai,mbi->mi", moments, form, form).mean(axis=1))
+        return value, 1 / (1 + np.exp(-np.clip(worth, -50, 50))), sizes
 
 
 def _longest(rows: NDArray[np.float32]) -> Floats:
     """Return each sensor's longest runs of zeros, and of readings as before, (2, D)."""
     run, longest = np.zeros((2, rows.shape[1])), np.zeros((2, rows.shape[1]))
-    for now, before in zip(rows, [rows[0] + 1, *rows[:-1]], strict=True):
+    for now, before in itertools.pairwise(rows):
         run = np.where([now == 0, now == before], run + 1, 0)
         longest = np.maximum(longest, run)
     return longest
+
+
+def _squares(errors: Floats, precision: NDArray[Any]) -> Floats:
+    """Return the squares of the Mahalanobis lengths of errors, (N,)."""
+    return np.asarray(((errors @ precision) * errors).sum(axis=1))
 
 
 def _scale(arrays: Sequence[NDArray[np.float32]]) -> FeatureScale:
@@ -458,7 +395,6 @@ def _covariance(errors: Floats) -> Floats:
     floor = FLOOR**2 * np.eye(dimensions)
     scatter = errors.T @ errors / len(errors) + floor
     for _ in range(STEPS):
-        lengths = np.einsum("nd,de,ne->n", errors, np.linalg.inv(scatter), errors)
-        weights = (FREEDOM + dimensions) / (FREEDOM + lengths)
+        weights = (FREEDOM + dimensions) / (FREEDOM + _squares(errors, np.linalg.inv(scatter)))
         scatter = (errors * weights[:, None]).T @ errors / len(errors) + floor
     return scatter
