@@ -35,7 +35,7 @@ from oodd_mewma.forecast import Moments, regressors
 
 FOLDS: Final = 5
 """Parts of the nominal trajectories, each judged by what was learnt from the others."""
-REFERENCE: Final = 1.5
+REFERENCE: Final = 2.5
 """Score that a row must exceed to count as anomalous in the estimate of the onset."""
 
 
