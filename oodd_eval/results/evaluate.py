@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.data.baseline import Baseline
+from oodd_eval.data.baseline import CONSTANT, Baseline
 from oodd_eval.data.condition import NOMINAL, Condition
 from oodd_eval.data.facts import LogFacts
 from oodd_eval.data.parts import CALIBRATION, TWINS, EnvironmentData, Interval, lengths_of, parts_of
@@ -33,7 +33,6 @@ from oodd_eval.metrics.recalibration import Draws, PairedScores, Recalibration
 from oodd_eval.metrics.unpaired import UnpairedScores
 from oodd_eval.plugins.contract import ROLLOUT_TOLERANCE, TOLERANCE, Scores
 from oodd_eval.plugins.explanations import KINDS, Named
-from oodd_eval.plugins.forecasting import FeatureScale
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
 from oodd_eval.results.identity import Cell
 from oodd_eval.results.record import NAN, CodedDraws, Metric, Record
@@ -134,7 +133,7 @@ def with_explanations(
     parts: dict[str, list[Scores]],
     asked: Iterable[tuple[Asked, Trajectory, object]],
     data: EnvironmentData,
-    scale: FeatureScale,
+    train: Sequence[Trajectory],
 ) -> ScoreFile:
     """Return scores of a unit beside explanations, which came back unchecked.
 
@@ -146,8 +145,8 @@ def with_explanations(
         Questions, the rows that these were of, and what came back.
     data
         The environment.
-    scale
-        Of the training episodes, by which the largest readings are found.
+    train
+        Training episodes, by which readings are standardized to find the largest.
 
     Returns
     -------
@@ -162,12 +161,16 @@ def with_explanations(
     first = {part: [np.full((2, len(x)), -1, np.int32) for x in xs] for part, xs in tests.items()}
     shape = 1 + len(NAMED_AFTER), 1 + len(data.sensors) + len(data.actions)
     namings = {part: np.zeros((len(xs), *shape), np.int8) for part, xs in tests.items()}
+    nominal = np.concatenate([x.observations for x in train]).astype(np.float64)
+    mean, std = nominal.mean(axis=0), nominal.std(axis=0)
     for (part, i, later, rows), x, array in asked:
         named = check_named(array, x, f"{data.id}/{part}[{i}]")
         namings[part][i, later, : len(named) - 2] = named[2:]
         if not later:
             first[part][i][:, rows - 1] = named[:2]
-            largest = np.argsort(-np.abs(scale(x)[-1]), kind="stable")
+            # A sensor that stood still has the scale 1, as detectors see it.
+            distances = np.abs(x.observations[-1] - mean) / np.where(std < CONSTANT, 1.0, std)
+            largest = np.argsort(-distances, kind="stable")
             namings[part][i, -1, 1 + largest[: named[3:].sum()]] = 1
     return ScoreFile(parts, {}, first, namings=namings)
 

@@ -19,7 +19,6 @@ from oodd_eval.metrics.catalogue import NAMED_AFTER
 from oodd_eval.plugins import contract, explanations
 from oodd_eval.plugins.contract import Progress, ignore_progress
 from oodd_eval.plugins.discovery import Offer, describe, printable
-from oodd_eval.plugins.forecasting import FeatureScale
 from oodd_eval.plugins.isolation.child import Launcher, Limits, Stop
 from oodd_eval.plugins.isolation.supervisor import Outcome, run_isolated
 from oodd_eval.plugins.state import PackedState
@@ -321,8 +320,7 @@ class GroupedScoring:
         if explained is None or not self._explains:
             return ScoreFile(self._whole(parts), {})
         asked = zip(self._asked, map(self._asked_rows, self._asked), explained, strict=True)
-        data = self._job.data
-        return with_explanations(parts, asked, data, FeatureScale.fit(self._train))
+        return with_explanations(parts, asked, self._job.data, self._train)
 
     def _checked(
         self, scores: Sequence[object], warm_up: object

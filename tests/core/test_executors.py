@@ -10,6 +10,7 @@ import threading
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from helpers_plugins import install
 from helpers_processes import SLOW, Cluster, environment, oodd_eval, wait_until, workers_of
@@ -34,13 +35,20 @@ NEVER = threading.Event()
 @pytest.fixture
 def job(tiny_split):
     """The clock's unit on cartpole."""
-    split, plugins = load_split(tiny_split), discover()
+    with unit_of(tiny_split, "clock") as job:
+        yield job
+
+
+@contextlib.contextmanager
+def unit_of(split_name, detector):
+    """A detector's unit on cartpole."""
+    split, plugins = load_split(split_name), discover()
     plan = make_plan(
-        plugins, split=split, detectors=["clock"],
+        plugins, split=split, detectors=[detector],
         environments=["cartpole"], anomalies=["iid"],
     )  # fmt: skip
     data = split.environment("cartpole")
-    yield UnitJob(plan, plan.units[0], data, plugins.offer("clock"))
+    yield UnitJob(plan, plan.units[0], data, plugins.offer(detector))
     data.close()
 
 
@@ -75,6 +83,18 @@ def test_an_order_is_json_and_gives_the_scores_of_a_local_unit(job, tiny_split):
     assert {k: [s.tolist() for s in v] for k, v in there["parts"].items()} == {
         k: [s.tolist() for s in v] for k, v in here.file.parts.items()
     }
+
+
+def test_explanations_and_namings_come_back_with_the_scores():
+    with unit_of("mini", "mewma-a") as job:  # a smaller split has no guaranteed alarms
+        there = ordered(job, "mini")
+        here = Executor(RunSettings(jobs=1), None, NEVER)(job).file
+    assert here.namings["test/iid"].any()
+    for name in ("parts", "explained", "namings"):
+        assert there[name].keys() == getattr(here, name).keys()
+        for part, episodes in getattr(here, name).items():
+            for rows, expected in zip(there[name][part], episodes, strict=True):
+                np.testing.assert_array_equal(rows, expected)
 
 
 def test_a_sandbox_travels_with_the_order(job, tiny_split):

@@ -34,7 +34,10 @@ def textbook(model, rows, actions, noise, start):
     forward = np.block([[b[:, :d], b[:, d : 2 * d]], [np.eye(d), np.zeros((d, d))]])
     driven = np.zeros((2 * d, 2 * d))
     driven[:d, :d] = model.covariance
-    state, spread = np.concatenate([standard[start - 1], standard[start - 2]]), np.zeros_like(driven)
+    state, spread = (
+        np.concatenate([standard[start - 1], standard[start - 2]]),
+        np.zeros_like(driven),
+    )
     read = np.flatnonzero(np.isfinite(noise))
     for t in range(start, len(rows)):
         pushed = b[:, 2 * d :] @ np.concatenate([commands[t - 1], commands[t - 2], [1.0]])
