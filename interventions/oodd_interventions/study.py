@@ -372,15 +372,19 @@ def run_cells(cells: Sequence[StudyCell]) -> dict[str, str]:
     oracles: dict[str, list[LoopArm]] = {}
     reasons: dict[str, str] = {}
     for cell in cells:
-        start, act, file = time.perf_counter(), cell.act, study.fit_file(cell.unit)
+        name, act, file = _name_of(cell.unit), cell.act, study.fit_file(cell.unit)
+        if name in reasons:
+            continue
         try:
-            if act.name not in oracles:
-                oracles[act.name] = [loop.oracle(pair, act) for pair in pairs]
             if file not in _detectors:
                 _detectors[file] = _restored(study, cell.unit)
+            if act.name not in oracles:
+                oracles[act.name] = [loop.oracle(pair, act) for pair in pairs]
+            start = time.perf_counter()
             outcome = run_cell(loop, pairs, oracles[act.name], act, _detectors[file])
         except Exception as error:  # noqa: BLE001  of foreign code
-            reasons[f"{_name_of(cell.unit)}/{record.condition}--{act.name}"] = describe(error)
+            failed = f"{name}/{record.condition}--{act.name}" if file in _detectors else name
+            reasons[failed] = describe(error)
             continue
         facts = {"provenance": gather(), "seconds": round(time.perf_counter() - start, 3)}
         write_text(cell.file, json.dumps(cell.identity() | facts | outcome))

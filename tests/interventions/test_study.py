@@ -1,0 +1,154 @@
+"""Studies: the same files for any number of processes and after an interrupt, failures reported."""
+
+import json
+
+import pytest
+from helpers_plugins import install
+from oodd_interventions import ActSpec
+from oodd_interventions.study import intervene, suiting
+from oodd_recording.build import build_split
+
+from oodd_eval.data.facts import SplitDefinition
+from oodd_eval.errors import UnknownNameError, UsageError
+
+KINDS = "iid,shutdown,wind-l2r"
+STUDY = {"kinds": KINDS, "seeds": 3, "jobs": 1, "acts": "mask"}
+
+
+@pytest.fixture(scope="module")
+def split(tmp_path_factory):
+    definition = SplitDefinition(
+        "small", train=8, calibration=38, test=1, episode_cap=120, seed_base=5
+    )
+    return build_split(definition, tmp_path_factory.mktemp("split"), environments=["cartpole"])
+
+
+def cells_of(output):
+    """What is in the files of cells, but for time and machine."""
+    cells = {}
+    for file in sorted((output / "cells").rglob("*")):
+        if file.is_file():
+            cell = json.loads(file.read_text())
+            del cell["provenance"], cell["seconds"]
+            cells[str(file.relative_to(output))] = cell
+    return cells
+
+
+@pytest.fixture(scope="module")
+def whole(split, tmp_path_factory):
+    """A study that nothing interrupts."""
+    output = tmp_path_factory.mktemp("study")
+    return intervene("mewma-a,mahalanobis", "cartpole", split=split, output=output, **STUDY)
+
+
+@pytest.mark.slow
+def test_files_and_cells_of_a_study(whole):
+    assert whole.reasons == {}
+    cells = cells_of(whole.output)
+    names = [f"cells/cartpole/{d}/{k}--mask.json" for d in ("mahalanobis", "mewma-a")
+             for k in ("iid", "shutdown")]  # fmt: skip
+    assert list(cells) == names
+    cell = cells[names[-1]]
+    identity = {"schema": "oodd-eval/intervention/1", "act": "mask", "level": 0.05, "cap": 120}
+    assert identity.items() <= cell.items()
+    assert [e["seed"] for e in cell["episodes"]] == [680_000_000 + k for k in range(3)]
+    returns = [[e["returns"][arm] for e in c["episodes"]] for c in whole.cells
+               for arm in ("oracle", "watchdog")]  # fmt: skip
+    assert all(sum(a) >= sum(b) for a, b in zip(returns[::2], returns[1::2], strict=True))
+    # Twin, never and oracle are the same for all detectors.
+    for kind in ("iid", "shutdown"):
+        of = [cells[f"cells/cartpole/{d}/{kind}--mask.json"] for d in ("mahalanobis", "mewma-a")]
+        for arm in ("twin", "never", "oracle"):
+            assert len({tuple(e["returns"][arm] for e in c["episodes"]) for c in of}) == 1
+
+
+@pytest.mark.slow
+def test_an_interrupted_study_goes_on_and_has_the_same_files(whole, split, tmp_path):
+    heard = []
+
+    def interrupt(done, total, text):
+        heard.append((done, total))
+        if done:
+            raise KeyboardInterrupt
+
+    names = ("mewma-a,mahalanobis", "cartpole")
+    with pytest.raises(KeyboardInterrupt):
+        intervene(*names, split=split, output=tmp_path, observer=interrupt, **STUDY)
+    assert heard[-1] == (2, 4)
+    fits = {f: f.stat().st_mtime_ns for f in (tmp_path / "fits").rglob("*.npz")}
+    assert fits
+    damaged = tmp_path / "cells/cartpole/mewma-a/iid--mask.json"
+    damaged.write_text(damaged.read_text()[:-9] if damaged.exists() else "")
+    later = []
+    again = intervene(
+        *names, split=split, output=tmp_path, observer=lambda *a: later.append(a[:2]),
+        **(STUDY | {"jobs": 2}),
+    )  # fmt: skip
+    assert cells_of(tmp_path) == cells_of(whole.output)
+    assert len(again.cells) == 4
+    assert {f: f.stat().st_mtime_ns for f in (tmp_path / "fits").rglob("*.npz")} == fits
+    assert later[-1] == (4, 4)
+
+
+PLUGIN = """
+from oodd_interventions import ActSpec
+
+class Failing(Good):
+    def fit(self, nominal):
+        raise ValueError("no fit today")
+
+class Still:
+    def __init__(self, situation):
+        self.row = len(situation.rows) - 1
+    def act(self, row):
+        if self.row < 0:
+            raise RuntimeError
+        return 0
+
+@hookimpl
+def oodd_detectors():
+    missing = DetectorSpec("missing", Good, "a test's", requires=("no_such_module",))
+    return [*offer(failing=Failing, good=Good), missing]
+
+@hookimpl
+def oodd_acts():
+    return [ActSpec("still", Still, "the first command", ("dynamics",), ("cartpole",))]
+"""
+
+
+@pytest.mark.slow
+def test_what_fails_is_reported_and_the_others_go_on(split, tmp_path, monkeypatch):
+    install(monkeypatch, tmp_path / "plugin", "acting", PLUGIN)
+    settings = STUDY | {"acts": "mask,still", "kinds": "iid,wind-l2r"}
+    output = tmp_path / "study"
+    study = intervene("failing,good,missing", "cartpole", split=split, output=output, **settings)
+    assert [(c["detector"], c["anomaly"], c["act"]) for c in study.cells] == [
+        ("good", "iid", "mask"),
+        ("good", "wind-l2r", "still"),
+    ]
+    assert study.reasons["cartpole/failing"] == "ValueError: no fit today"
+    assert "no_such_module" in study.reasons["cartpole/missing"]
+    # It does not explain, so that it names nothing and its mask changes nothing.
+    masked, still = (cell["episodes"] for cell in study.cells)
+    assert all(e["returns"]["watchdog"] == e["returns"]["never"] for e in masked)
+    assert all(e["named"].get("0", {}).get("kind", "") == "" for e in masked)
+    assert any(e["acted"]["watchdog"] is not None for e in still)
+
+
+def test_wrong_names_and_the_base_of_the_split_are_refused(split, tmp_path):
+    with pytest.raises(UsageError, match="base=5 is that of split"):
+        intervene("mewma-a", "cartpole", split=split, base=5, output=tmp_path)
+    with pytest.raises(UnknownNameError, match="act"):
+        intervene("mewma-a", "cartpole", split=split, acts="mosk", output=tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_act_of_the_environment_takes_the_place_of_a_general_one():
+    general = ActSpec("stop", None, "", ("sensor", "dynamics"))
+    special = ActSpec("stop", None, "", ("dynamics",), ("cartpole",))
+    other = ActSpec("switch", None, "", ("dynamics",), ("hopper",))
+    acts = [special, general, other]
+    assert suiting(acts, ["stop", "switch"], "cartpole", "dynamics") == (special,)
+    assert suiting(acts, ["stop", "switch"], "cartpole", "sensor") == (general,)
+    assert suiting(acts, ["switch"], "hopper", "dynamics") == (other,)
+    assert suiting(acts, ["stop"], "hopper", "dynamics") == (general,)
