@@ -1,4 +1,4 @@
-"""MuJoCo's Swimmer as an environment of oodd-eval, and a fluid that gets thicker."""
+"""MuJoCo's Swimmer as an environment of oodd-eval, a fluid that gets thicker, and a safe stop."""
 
 from pathlib import Path
 
@@ -73,3 +73,26 @@ def oodd_anomalies():
             intermittent=True,
         )
     ]
+
+
+class Stretched:
+    """A safe stop: both joints are pulled straight, and the swimmer drifts."""
+
+    def act(self, row):
+        return [
+            max(-1.0, min(1.0, -0.2 * float(row[i]) - 0.05 * float(row[i + 5]))) for i in (1, 2)
+        ]
+
+
+def make_stretched(situation):
+    """Return the act; it needs nothing of the situation at the alarm."""
+    return Stretched()
+
+
+@hookimpl
+def oodd_acts():
+    """Offer the stop."""
+    from oodd_interventions import ActSpec
+
+    summary = "both joints are pulled straight, and the swimmer drifts"
+    return [ActSpec("stop", make_stretched, summary, ("dynamics",), ("swimmer",))]
