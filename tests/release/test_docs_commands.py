@@ -110,6 +110,9 @@ KNOWN = {
     "docs/how-to/own-environment.md": {
         "files": {"oodd_pendulum.py": "```python", "pyproject.toml": "```toml"}
     },
+    "docs/how-to/interventions.md": {
+        "files": {"oodd_swing.py": "```python", "pyproject.toml": "```toml"}
+    },
     "docs/how-to/policies.md": {
         "files": {"make_actor.py": "```python"},
         "folders": ["recording/policies"],

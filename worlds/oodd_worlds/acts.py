@@ -16,6 +16,7 @@ DRONE_WAY: Final = slice(12, 15)
 DESCENT: Final = 0.4
 """Speed in m/s at which the drone comes down."""
 PERIOD: Final = 0.02
+"""Seconds a row, of arm and drone."""
 SAFE_LEVELS: Final = (6.0, 6.0)
 """Set points in cm: half of the usual ones, far from both ends of the tanks."""
 
