@@ -1,4 +1,4 @@
-"""What is committed under leaderboard/, for the numbers of README.md and docs/results.md."""
+"""What is committed under leaderboard/, for the numbers of README.md and pages of results."""
 
 import csv
 import functools
@@ -16,6 +16,7 @@ from oodd_eval.results.record import Record
 ROOT = Path(__file__).parents[2]
 BOARD = ROOT / "leaderboard"
 README, RESULTS = ROOT / "README.md", ROOT / "docs" / "results.md"
+INTERVENTIONS = ROOT / "docs" / "interventions.md"
 
 Row = Callable[[str], str]
 """Return the cells of a row behind its first one, separated by bars, from what the first names."""

@@ -1,4 +1,4 @@
-"""Fill the tables of README.md and docs/results.md from what is committed under leaderboard/.
+"""Fill the tables of README.md and pages of results from what is committed.
 
 A table below a comment such as ``<!-- table: board mini -->`` has rows whose first cell the author
 writes; this program writes the other cells. Run ``python docs/figures/tables.py`` after a change of
@@ -9,6 +9,8 @@ document is not that of what is committed: in these tables, in sentences beside 
 
 import functools
 import io
+import json
+import math
 import os
 import re
 import sys
@@ -22,6 +24,7 @@ from unittest.mock import patch
 import sentences
 from committed import (
     BOARD,
+    INTERVENTIONS,
     README,
     RESULTS,
     ROOT,
@@ -36,6 +39,8 @@ from committed import (
     primary,
     ranking,
 )
+from oodd_interventions.columns import ALL, COLUMNS, row_of
+from oodd_interventions.page import sections
 from oodd_leaderboard.pages import documents
 
 from oodd_eval.cli.main import main as oodd_eval
@@ -46,10 +51,12 @@ from oodd_eval.results.identity import Setting
 from oodd_eval.results.strengths import DETECTION, Strengths
 from oodd_eval.results.tables import Tables
 
-PAGES = (README, RESULTS)
+PAGES = (README, RESULTS, INTERVENTIONS)
 
 MAIN = Path(__file__).with_name("main.jsonl.xz")
 """Records of the README's main command: ``records.jsonl`` of its results."""
+STUDY = Path(__file__).with_name("interventions.jsonl.xz")
+"""Records of the study of interventions: ``records.jsonl`` of its directory."""
 LOGS = ("skab", "alfa", "rosa", "tep", "nab", "uci", "ur3", "pi0-libero")
 """Sets of public logs that have anomalous episodes, in the order of columns."""
 
@@ -215,6 +222,43 @@ def on_logs(metric: str = "") -> Row:
     return lambda name: " | ".join(value(logs()[environment], name) for environment in LOGS)
 
 
+@functools.cache
+def study() -> list[dict]:
+    """Return the records of the study of interventions."""
+    return [json.loads(line) for line in read_text(STUDY).splitlines()]
+
+
+@functools.cache
+def of_title(title: str) -> dict[str, list[str]]:
+    """Return the rows of the study's table whose title begins so, by their labels."""
+    tables = (table for section in sections(study()) for table in section.tables)
+    (table,) = (table for table in tables if table.title.startswith(title))
+    return {", ".join(row[: table.labels]): row[table.labels :] for row in table.rows}
+
+
+def of_study(title: str) -> Row:
+    """Return the cells of a row of one of the study's tables."""
+    return lambda labels: " | ".join(of_title(title)[labels])
+
+
+def worth(place: str) -> str:
+    """Return AUC over sensor faults, and what naming and masking at the alarm are worth.
+
+    The row is named as ``hopper, panel-a``.
+    """
+    environment, name = place.split(", ")
+    suite = "mini" if environment in board("mini").environments else "worlds"
+    sensor = board(suite).in_group("sensor")
+    auc = mean(suite, name, "auc_matched", environments=[environment], anomalies=sensor)
+    key = (environment, ALL, name, "mask")
+    (record,) = (r for r in study() if (r["environment"], r["anomaly"], row_of(r), r["act"]) == key)
+    columns = ("named_precision", "named_recall", "named_recall_20", "return_saved")
+    figures = ((record["intervention"][column]["value"], COLUMNS[column]) for column in columns)
+    return " | ".join(
+        [f"{auc:.1f}", *(info.text(math.nan if x is None else x) for x, info in figures)]
+    )
+
+
 def verdicts(text: str) -> str:
     """Return the verdicts on a claim, by the paper's measure and by the fair one."""
     by_text = {(r["text"], kind): r["verdict"] for (_, kind), r in claims("mini").items()}
@@ -240,6 +284,11 @@ TABLES: dict[str, Row] = {
     "claims": verdicts,
     "logs": on_logs(),
     "logs false": on_logs("false_episodes_at_10pct"),
+    "mask": of_study("Return saved by mask"),
+    "mask costs": of_study("What mask prevents"),
+    "mask harmless": of_study("Faults that mask cannot mend"),
+    "namings": of_study("Parts named"),
+    "worth": worth,
 }
 
 
@@ -269,7 +318,7 @@ def problems(pages: dict[Path, str]) -> Iterator[str]:
     Parameters
     ----------
     pages
-        The Markdown of README.md and docs/results.md by path.
+        The Markdown of `PAGES` by path.
     """
     for path, text in pages.items():
         if filled(text) != text:
