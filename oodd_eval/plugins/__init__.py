@@ -19,14 +19,22 @@ PROJECT: Final = "oodd_eval"
 """Name of the pluggy project and of the entry-point group."""
 
 OFFER_HOOKS: Final = (
-    *("oodd_detectors", "oodd_environments", "oodd_anomalies", "oodd_acts", "oodd_kinds"),
-    *("oodd_readers", "oodd_detector_from_spec"),
+    "oodd_detectors",
+    "oodd_environments",
+    "oodd_anomalies",
+    "oodd_acts",
+    "oodd_kinds",
+    "oodd_readers",
+    "oodd_detector_from_spec",
 )
 """Hooks of this module."""
 
 OBSERVER_HOOKS: Final = (
-    *("oodd_run_started", "oodd_unit_started", "oodd_fit_progressed"),
-    *("oodd_cell_finished", "oodd_run_finished"),
+    "oodd_run_started",
+    "oodd_unit_started",
+    "oodd_fit_progressed",
+    "oodd_cell_finished",
+    "oodd_run_finished",
 )
 """Hooks that `oodd_eval.scoring.observers` specifies and calls."""
 
