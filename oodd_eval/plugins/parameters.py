@@ -91,14 +91,8 @@ class ParameterInfo:
         return "" if self.high is None or value <= self.high else f"expected at most {self.high:g}"
 
 
-_TYPE_NAMES = {
-    int: "a whole number",
-    float: "a number",
-    str: "a text",
-    bool: "true or false",
-    types.NoneType: "null",
-    list: "a list",
-}
+_TYPE_NAMES = {int: "a whole number", float: "a number", str: "a text", bool: "true or false"}
+_TYPE_NAMES |= {types.NoneType: "null", list: "a list"}
 
 
 def parameters_of(declared: type | None) -> dict[str, ParameterInfo]:

@@ -64,6 +64,8 @@ STREAM: Final = "stream"
 """Dataset of the surprise of the stream by row beside ``scores``."""
 
 
+_TOO_LARGE: Final = (OverflowError, RecursionError)  # numbers and texts of damaged files
+
 VOICES: Final = "voices"
 """Attribute of a score file: what voices cost, as JSON."""
 
@@ -502,14 +504,7 @@ class FitStore:
             packed = read_state(self._file(key))
             content = json.loads(packed.text)
             text, seconds = json.dumps(content["state"]), float(content["seconds_fit"])
-        except (
-            FittedStateError,
-            LookupError,
-            TypeError,
-            ValueError,
-            OverflowError,
-            RecursionError,
-        ):
+        except (FittedStateError, LookupError, TypeError, ValueError, *_TOO_LARGE):
             return None
         if not 0 <= seconds < math.inf:
             return None

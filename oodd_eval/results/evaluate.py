@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import islice
 from types import MappingProxyType
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,18 +120,9 @@ def first_alarms(
     return {part: [rule.first(x) if rule else None for x in xs] for part, xs in tests.items()}
 
 
-class Asked(NamedTuple):
-    """A question to a detector that explains: its episode, which one after an alarm, and rows."""
-
-    part: str
-    number: int
-    later: int
-    rows: int
-
-
 def with_explanations(
     parts: dict[str, list[Scores]],
-    asked: Iterable[tuple[Asked, Trajectory, object]],
+    asked: Iterable[tuple[tuple[str, int], int, Trajectory, object]],
     data: EnvironmentData,
     train: Sequence[Trajectory],
 ) -> ScoreFile:
@@ -142,7 +133,8 @@ def with_explanations(
     parts
         Scores of episodes with twins, by part.
     asked
-        Questions, the rows that these were of, and what came back.
+        Part and number of an episode, which of `NAMED_AFTER` is meant, the rows until then, and
+        what came back.
     data
         The environment.
     train
@@ -163,11 +155,11 @@ def with_explanations(
     namings = {part: np.zeros((len(xs), *shape), np.int8) for part, xs in tests.items()}
     nominal = np.concatenate([x.observations for x in train]).astype(np.float64)
     mean, std = nominal.mean(axis=0), nominal.std(axis=0)
-    for (part, i, later, rows), x, array in asked:
+    for (part, i), later, x, array in asked:
         named = check_named(array, x, f"{data.id}/{part}[{i}]")
         namings[part][i, later, : len(named) - 2] = named[2:]
         if not later:
-            first[part][i][:, rows - 1] = named[:2]
+            first[part][i][:, len(x) - 1] = named[:2]
             # A sensor that stood still has the scale 1, as detectors see it.
             distances = np.abs(x.observations[-1] - mean) / np.where(std < CONSTANT, 1.0, std)
             largest = np.argsort(-distances, kind="stable")

@@ -342,15 +342,9 @@ class Record:
         ``training``, ``paired``, ``rolling``, ``note``, ``recordings`` and ``calibration_draws``
         are left out where they say nothing.
         """
-        silent: dict[str, Any] = {
-            "training": "nominal",
-            "magnitude": None,
-            "paired": True,
-            "rolling": False,
-            "note": "",
-            "recordings": {},
-            "calibration_draws": CodedDraws(),
-        }
+        silent: dict[str, Any] = {"training": "nominal", "magnitude": None, "paired": True}
+        silent |= {"rolling": False, "note": "", "recordings": {}}
+        silent["calibration_draws"] = CodedDraws()
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         plain = {n: v for n, v in values.items() if n not in silent or v != silent[n]}
         plain["metrics"] = {

@@ -24,7 +24,7 @@ from oodd_eval.plugins.isolation.supervisor import Outcome, run_isolated
 from oodd_eval.plugins.state import PackedState
 from oodd_eval.plugins.voices import costs_of_voices, first_rows
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
-from oodd_eval.results.evaluate import Asked, first_alarms, with_explanations
+from oodd_eval.results.evaluate import first_alarms, with_explanations
 from oodd_eval.results.record import Status
 from oodd_eval.scoring.plan import Plan, Unit
 
@@ -164,7 +164,8 @@ class GroupedScoring:
         self._groups = mixed(sizes) if job.streamed else groups(sizes)
         # Metrics with twins alone are of explanations, and there are no baseline rows then.
         self._explains = job.data.paired and not rows and not job.streamed
-        self._asked: list[Asked] = []
+        # Of what is explained: the episode, which of the rows after its alarm, and rows until then.
+        self._asked: list[tuple[Member, int, int]] = []
         # What voices are compared on, and how.
         calibration = (Member(CALIBRATION, i) for i in range(sizes[CALIBRATION]))
         self._heard = first_rows(self._members(calibration))
@@ -290,18 +291,14 @@ class GroupedScoring:
         self._asked = []
         for group in self._groups:
             asked = [
-                Asked(part, i, later, min(first + 1 + rows, self._lengths[part][i]))
+                (Member(part, i), later, min(first + 1 + rows, self._lengths[part][i]))
                 for later, rows in enumerate(NAMED_AFTER)
                 for part, i in group
                 if part in firsts and (first := firsts[part][i]) is not None
             ]
             if asked:
                 self._asked += asked
-                yield map(self._asked_rows, asked)
-
-    def _asked_rows(self, asked: Asked) -> Trajectory:
-        """Return the rows of an episode that an explanation is asked of."""
-        return self._visible(self._sets[asked.part][asked.number])[: asked.rows]
+                yield (self._visible(self._sets[part][i])[:n] for (part, i), _, n in asked)
 
     def _members(self, group: Iterable[Member]) -> Iterator[Trajectory]:
         return (self._visible(self._sets[part][i]) for part, i in group)
@@ -319,7 +316,10 @@ class GroupedScoring:
         parts = self._checked(scores, warm_up)
         if explained is None or not self._explains:
             return ScoreFile(self._whole(parts), {})
-        asked = zip(self._asked, map(self._asked_rows, self._asked), explained, strict=True)
+        asked = (
+            (member, later, self._visible(self._sets[member.part][member.number])[:n], array)
+            for (member, later, n), array in zip(self._asked, explained, strict=True)
+        )
         return with_explanations(parts, asked, self._job.data, self._train)
 
     def _checked(
