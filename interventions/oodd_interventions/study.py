@@ -57,8 +57,18 @@ DETECTOR: Final = "detector."
 """Prefix of a detector's arrays in the file of its fit."""
 SCHEMA: Final = "oodd-eval/intervention/1"
 IDENTITY: Final = (
-    *("detector", "detector_version", "plugin", "plugin_source", "parameters", "overrides"),
-    *("seed", "horizon", "environment", "group", "split", "split_digest"),
+    "detector",
+    "detector_version",
+    "plugin",
+    "plugin_source",
+    "parameters",
+    "overrides",
+    "seed",
+    "horizon",
+    "environment",
+    "group",
+    "split",
+    "split_digest",
 )
 """Fields of a record that say what a cell is of."""
 BASE: Final = 680

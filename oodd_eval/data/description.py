@@ -15,12 +15,26 @@ from oodd_eval.data.parts import AnomalousSet, EnvironmentData, LabelledSet, Tra
 from oodd_eval.data.split import Split
 
 HEADER: Final = (
-    *("group", "trajectories", "transitions", "length", "onset", "effect", "tail"),
-    *("redraws", "return"),
+    "group",
+    "trajectories",
+    "transitions",
+    "length",
+    "onset",
+    "effect",
+    "tail",
+    "redraws",
+    "return",
 )
 LOGS_HEADER: Final = (
-    *("part", "episodes", "tasks", "rows", "length", "intervals", "anomalous rows"),
-    *("outcome only", "return"),
+    "part",
+    "episodes",
+    "tasks",
+    "rows",
+    "length",
+    "intervals",
+    "anomalous rows",
+    "outcome only",
+    "return",
 )
 _WRAPPER: Final = textwrap.TextWrapper(100, subsequent_indent="  ", break_long_words=False)
 Rows = list[list[str]]

@@ -24,8 +24,14 @@ ROWS: Final = frozenset({"observations", "actions", "rewards"})
 """Datasets of a split with a row for each step: they are read in ranges, all others at once."""
 
 _BROKEN: Final = (
-    *(OSError, ValueError, KeyError, TypeError, RuntimeError, AttributeError),
-    *(OverflowError, MemoryError),
+    OSError,
+    ValueError,
+    KeyError,
+    TypeError,
+    RuntimeError,
+    AttributeError,
+    OverflowError,
+    MemoryError,
 )  # what h5py raises for damage
 _DEFLATE: Final = 1032  # bytes that the format can make of one
 _FILTERS: Final = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32}

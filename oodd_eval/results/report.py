@@ -169,8 +169,20 @@ def flat(records: Sequence[Record]) -> list[dict[str, Any]]:
     Every mapping has the metrics of all records, NaN where a cell lacks one.
     """
     names = (
-        *("split", "environment", "anomaly", "strength", "magnitude", "group", "paired"),
-        *("detector", "horizon", "seed", "status", "reason", "note", "brief"),
+        "split",
+        "environment",
+        "anomaly",
+        "strength",
+        "magnitude",
+        "group",
+        "paired",
+        "detector",
+        "horizon",
+        "seed",
+        "status",
+        "reason",
+        "note",
+        "brief",
     )
     costs = ("seconds_fit", "seconds_score", "steps_scored", "peak_rss_mb")
     metrics = dict.fromkeys(name for r in records for name in r.metrics)
