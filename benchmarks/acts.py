@@ -14,7 +14,7 @@ import numpy as np
 import oodd_worlds
 from oodd_common.naming import ReadingModel
 from oodd_interventions.acts import ACTS
-from oodd_interventions.loop import Loop, NamedParts, Pair, oracle_arms
+from oodd_interventions.loop import Loop, LoopPair, NamedParts
 from oodd_recording.closed_loop import Setup, measure, record_anomalous, return_of
 from oodd_recording.policies import load_policy
 from oodd_recording.registered import info_of
@@ -68,7 +68,9 @@ def study(environment, seeds, base, names):
     ]
     cells = {
         kind: [
-            Pair(kind, strength, "dynamics", twin, record_anomalous(setup, kind, strength, twin))
+            LoopPair(
+                kind, strength, "dynamics", twin, record_anomalous(setup, kind, strength, twin)
+            )
             for twin in twins
         ]
         for kind, strength in kinds_of(environment).items()
@@ -77,18 +79,19 @@ def study(environment, seeds, base, names):
     print(f"| {environment} | act | nominal | {' | '.join(cells)} |")
     print(f"| {environment} | never | {text_of(loop, twins)} | {' | '.join(columns)} |")
     for spec in specs:
+        named = {0: NamedParts(nothing, ROW)}
         forced = [
             loop.arm(
-                Pair("", None, "dynamics", twin, twin),
+                LoopPair("", None, "dynamics", twin, twin),
+                spec,
+                ROW,
+                lambda _, since, named=named: named.get(since),
                 nominal=True,
-                spec=spec,
-                row=ROW,
-                name=lambda _, since: None if since else NamedParts(nothing, ROW),
             ).episode
             for twin in twins
         ]
         columns = [
-            text_of(loop, [arm.episode for arm in oracle_arms(loop, pairs, spec)])
+            text_of(loop, [loop.oracle(pair, spec).episode for pair in pairs])
             for pairs in cells.values()
         ]
         line = f"{text_of(loop, forced)} | {' | '.join(columns)}"

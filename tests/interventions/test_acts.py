@@ -14,7 +14,7 @@ pytest.importorskip("gymnasium", reason="needs the extra gym")
 import oodd_worlds
 from oodd_common.naming import ReadingModel
 from oodd_interventions.acts import ACTS, Compensated, failed
-from oodd_interventions.loop import Loop, NamedParts, Pair, oracle_arms
+from oodd_interventions.loop import Loop, LoopPair, NamedParts
 from oodd_recording.closed_loop import Setup, measure, record_anomalous, return_of
 from oodd_recording.policies import load_policy
 from oodd_recording.registered import info_of
@@ -72,13 +72,8 @@ def forced(environment, spec, cap=None, seed=SEED):
     twin, info = loop.setup.record(seed), info_of(environment)
     nobody = np.zeros(info.observation_dim)
     naming = Naming(nobody, np.zeros(info.action_dim), np.full_like(nobody, np.nan))
-    arm = loop.arm(
-        Pair("", None, "dynamics", twin, twin),
-        nominal=True,
-        spec=spec,
-        row=ROW,
-        name=lambda _, since: None if since else NamedParts(naming, ROW),
-    )
+    pair, named = LoopPair("", None, "dynamics", twin, twin), {0: NamedParts(naming, ROW)}
+    arm = loop.arm(pair, spec, ROW, lambda _, since: named.get(since), nominal=True)
     return twin, arm.episode
 
 
@@ -150,9 +145,8 @@ def test_a_pole_is_balanced_in_wind_in_which_the_policy_drops_it():
     loop = loop_of("cartpole")
     twin = loop.setup.record(SEED)
     never = record_anomalous(loop.setup, "wind-l2r", None, twin)
-    (arm,) = oracle_arms(
-        loop, [Pair("wind-l2r", None, "dynamics", twin, never)], act_of("switch", "cartpole")
-    )
+    pair = LoopPair("wind-l2r", None, "dynamics", twin, never)
+    arm = loop.oracle(pair, act_of("switch", "cartpole"))
     assert loop.failed(never)
     assert not loop.failed(arm.episode)
 
@@ -162,14 +156,14 @@ def test_a_push_on_all_motors_is_found_and_taken_off():
     loop = loop_of("hopper")
     twin = loop.setup.record(SEED)
     never = record_anomalous(loop.setup, "wind-r2l", None, twin)
-    pair, acts = Pair("wind-r2l", None, "dynamics", twin, never), []
+    pair, acts = LoopPair("wind-r2l", None, "dynamics", twin, never), []
 
     def make(situation):
         acts.append(Compensated(situation))
         return acts[0]
 
     spec = type(SPECS[0])("switch", make, "", ("dynamics",))
-    (arm,) = oracle_arms(loop, [pair], spec)
+    arm = loop.oracle(pair, spec)
     push = np.linalg.solve(acts[0]._precision, acts[0]._evidence)
     np.testing.assert_allclose(push, -0.33, atol=0.12)
     assert return_of(arm.episode) > 0.9 * return_of(twin)
