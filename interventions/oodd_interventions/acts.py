@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from oodd_recording.policies import Policy, load_policy
+from oodd_recording.policies import CustomPolicy, Policy, load_policy
 from oodd_recording.registered import info_of
 
 from oodd_eval import Trajectory
@@ -67,15 +67,9 @@ class Mask:
         return self._situation.policy.act(self._sensor.row(row))
 
 
-class Controller:
-    """Another controller takes over: a function of the row."""
-
-    def __init__(self, command: Callable[[Row], Any], _: Situation | None = None) -> None:
-        self._command = command
-
-    def act(self, row: Row) -> Any:
-        """Return its command for the row."""
-        return self._command(row)
+def controlled(command: Callable[[Row], Any], situation: Situation) -> Policy:
+    """Let another controller take over: a function of the row."""
+    return CustomPolicy(situation.environment, command)
 
 
 def balance(row: Row) -> int:
@@ -105,15 +99,15 @@ def _thrust(row: Row, angle: float, up: float) -> int:
     return 1 if turn > 0.05 else 3 if turn < -0.05 else 0
 
 
-def brace(situation: Situation) -> Controller:
+def brace(situation: Situation) -> Policy:
     """Pull all joints of a robot to the middles of their ranges, and brake them."""
     joints = slice(8, 8 + 2 * situation.actions.shape[1])  # angle and speed of each in turn
 
     def pull(row: Row) -> Row:
         angles, speeds = row[joints][::2], row[joints][1::2]
-        return np.clip(-angles - 0.5 * speeds, -1, 1).astype(np.float32)
+        return np.clip(-angles - 0.5 * speeds, -1, 1)
 
-    return Controller(pull)
+    return controlled(pull, situation)
 
 
 def stand(situation: Situation) -> Policy:
@@ -176,9 +170,9 @@ ACTS: Final = [
     ActSpec("mask", Mask, "the policy gets estimates for the named sensors", ("sensor",)),
     _of("stop", brace, "the joints go to the middles of their ranges", "ant", "halfcheetah"),
     _of("stop", stand, "a policy that has learnt to stand takes over", "hopper"),
-    _of("stop", partial(Controller, descend), "the lander comes down where it is", "lunarlander"),
-    _of("switch", partial(Controller, balance), "linear feedback balances the pole", "cartpole"),
-    _of("switch", partial(Controller, land), "Gymnasium's heuristic lands it", "lunarlander"),
+    _of("stop", partial(controlled, descend), "the lander comes down where it is", "lunarlander"),
+    _of("switch", partial(controlled, balance), "linear feedback balances the pole", "cartpole"),
+    _of("switch", partial(controlled, land), "Gymnasium's heuristic lands it", "lunarlander"),
     _of("switch", Compensated, "a push on the motors is estimated and taken off", *_ROBOTS),
 ]
 """The acts of the seven."""
