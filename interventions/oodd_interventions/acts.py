@@ -100,7 +100,7 @@ def _thrust(row: Row, angle: float, up: float) -> int:
 
 
 def brace(situation: Situation) -> Policy:
-    """Pull all joints of a robot to the middles of their ranges, and brake them."""
+    """Pull all joints to the middles of their ranges, where Ant stands, and brake them."""
     joints = slice(8, 8 + 2 * situation.actions.shape[1])  # angle and speed of each in turn
 
     def pull(row: Row) -> Row:
@@ -168,7 +168,7 @@ _ROBOTS: Final = ("ant", "halfcheetah", "hopper", "walker2d")
 
 ACTS: Final = [
     ActSpec("mask", Mask, "the policy gets estimates for the named sensors", ("sensor",)),
-    _of("stop", brace, "the joints go to the middles of their ranges", "ant", "halfcheetah"),
+    _of("stop", brace, "the joints go to the middles of their ranges", "ant"),
     _of("stop", stand, "a policy that has learnt to stand takes over", "hopper"),
     _of("stop", partial(controlled, descend), "the lander comes down where it is", "lunarlander"),
     _of("switch", partial(controlled, balance), "linear feedback balances the pole", "cartpole"),
