@@ -86,10 +86,10 @@ def _record(parts: _Parts, scope: int, behind: Mapping[str, Any]) -> Interventio
         record |= dict.fromkeys(("environment", "anomaly", "group")[scope - 2 :], ALL)
     else:
         record["returns"] = {arm: float(_returns(cell, arm).mean()) for arm in ARMS}
-    record |= {"behind": behind} if behind else {}
-    plain: InterventionRecord = without_nan(
-        record | {"intervention": {name: _figure(parts, name) for name in COLUMNS}}
-    )
+    if behind:
+        record["behind"] = behind
+    record["intervention"] = {name: _figure(parts, name) for name in COLUMNS}
+    plain: InterventionRecord = without_nan(record)
     return plain
 
 

@@ -3,7 +3,7 @@
 The evaluator knows it by name only (`oodd_eval.cli.main`).
 """
 
-import time
+from typing import Final
 
 import click
 
@@ -23,10 +23,12 @@ from oodd_eval.cli import (
 from oodd_eval.cli.console import make_console
 from oodd_eval.names import counted
 from oodd_eval.prose import print_prose, print_sections
-from oodd_eval.scoring.display import Pace
 from oodd_interventions import study
-from oodd_interventions.columns import records_of
 from oodd_interventions.page import REPORT, sections, write_pages
+
+_SETTINGS: Final = ("split", "kinds", "acts", "seeds", "base", "jobs", "fresh", "output")
+_PERCENT: Final = click.FloatRange(0, 100, min_open=True, max_open=True)
+_PERCENT.name = "PERCENT"
 
 
 @command(
@@ -36,17 +38,11 @@ from oodd_interventions.page import REPORT, sections, write_pages
 @click.option("--detector", required=True, type=Names("detectors"), help=NAMES)
 @click.option("--env", required=True, type=Names("envs"), help=NAMES)
 @click.option("--split", default="mini", type=Name("splits"), help="recorded split to fit on")
-@click.option("--kind", default="all", type=Names("anomalies"), help="kinds of anomalies")
-@click.option("--act", default="all", metavar="NAMES", help="acts, such as mask, stop and switch")
+@click.option("--kind", "kinds", default="all", type=Names("anomalies"), help=NAMES)
+@click.option("--act", "acts", default="all", help="acts, such as mask, stop and switch")
 @click.option("--seeds", default=10, type=COUNT, help="episodes of each kind, recorded anew")
 @click.option("--base", default=study.BASE, type=COUNT, help="millions of the first seed")
-@click.option(
-    "--level",
-    default=5.0,
-    metavar="PERCENT",
-    type=click.FloatRange(0, 100, min_open=True, max_open=True),
-    help="alarms at most in this percentage of nominal episodes",
-)
+@click.option("--level", default=5.0, type=_PERCENT, help="nominal episodes with alarms, at most")
 @click.option("--param", multiple=True, type=PARAMETER, help=PARAM)
 @jobs_option
 @click.option("--fresh", is_flag=True, help="fit and run again what the directory has already")
@@ -62,31 +58,16 @@ def intervene(options: Options) -> int:
     The exit code is 1 when a detector failed, and 2 when the study was interrupted. What was done
     is kept: the same command goes on.
     """
-    console, pace = make_console(), Pace(0, time.perf_counter())
-    progress = make_console(quiet=options.verbosity < 0)
-
-    def observe(done: int, total: int, text: str) -> None:
-        if not pace.total:  # what an earlier call has done comes with the first message
-            pace.total, pace.done = total, done
-        for _ in range(done - pace.done):
-            pace.add(time.perf_counter(), resumed=False)
-        progress.print(f"{text:<32}  {pace}")
-
+    console, notes = make_console(), make_console(quiet=options.verbosity < 0)
+    settings = {name: getattr(options, name) for name in _SETTINGS}
     try:
         done = study.intervene(
             options.detector,
             options.env,
-            split=options.split,
-            kinds=options.kind,
-            acts=options.act,
-            seeds=options.seeds,
-            base=options.base,
             level=options.level / 100,
             parameters=dict(options.param),
-            jobs=options.jobs,
-            fresh=options.fresh,
-            output=options.output,
-            observer=observe,
+            observer=lambda n, total, text: notes.print(f"{n}/{total}  {text}"),
+            **settings,
         )
     except KeyboardInterrupt:
         say(f"what was done is kept in {options.output}; the same command continues")
@@ -96,11 +77,11 @@ def intervene(options: Options) -> int:
     if not done.cells:
         return 1 if done.reasons else say("no act suits these kinds of anomalies", 5)
     write_pages(done.output, done.cells)
-    parts = sections(records_of(done.cells))
+    parts = sections(done.records)
     if options.verbosity >= 0:
         print_sections(parts, console)
     else:
-        print_prose("\n".join(part.verdict for part in parts if part.verdict), console)
+        print_prose(" ".join(part.verdict for part in parts), console)
     cells = counted(len(done.cells), "cell(s)")
     console.print(f"{cells} in {done.output}, tables in {REPORT}, plots in ENVIRONMENT.html")
     return int(bool(done.reasons))

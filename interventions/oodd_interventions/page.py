@@ -6,6 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 from html import escape
 from importlib.resources import files
 from pathlib import Path
+from string import Template
 from typing import Final, TypeAlias
 
 import numpy as np
@@ -33,14 +34,7 @@ REPORT: Final = "report.md"
 
 _SAVED, _PLACEBO, _HARM = "return_saved", "placebo_saved", "harm_on_nominal"
 _POINTS: Final = 200  # of a line in a plot, about
-_ARMS: Final = (
-    "Lines are the reward gained on the healthy twins, summed up from left to right, mean over "
-    "episodes. Never: nothing acts; watchdog: acts at the alarm; oracle: acts at once on the true "
-    "parts; placebo: acts at another episode's alarm; on the twins false: acts at false alarms; "
-    "forced: acts as in the faulty partner. The full upright line is the effect of the fault, the "
-    "dotted one the median alarm."
-)
-_STYLES: Final = files("oodd_interventions")
+_FILES: Final = files("oodd_interventions")
 
 
 def sections(records: Records) -> list[Section]:
@@ -53,7 +47,7 @@ def sections(records: Records) -> list[Section]:
     """
     acts = dict.fromkeys(record["act"] for record in records)
     parts = [_of_act(act, [r for r in records if r["act"] == act]) for act in acts]
-    rows = {row_of(r): r for r in _overall(records) if not math.isnan(_value(r, "named_precision"))}
+    rows = {row_of(r): r for r in _overall(records) if _value(r, "named_precision") > -1}
     title = "Parts named at the alarm (onset error in rows, the rest in %)"
     named = [_table(title, [*rows.values()], NAMINGS)] * bool(rows)
     notes = ["The return is the sum of an episode's rewards; [95 % intervals] are over seeds."]
@@ -63,28 +57,30 @@ def sections(records: Records) -> list[Section]:
 
 def _of_act(act: str, records: Records) -> Section:
     """Return the tables of one act, and the sentence that says what it is worth."""
-    rows = sorted(_overall(records), key=lambda r: -np.nan_to_num(_value(r, _SAVED), nan=-math.inf))
+    rows = sorted(_overall(records), key=lambda r: -_value(r, _SAVED, -math.inf))
     cells = [r for r in records if r["anomaly"] != ALL]
     several = len({r["environment"] for r in cells}) > 1
-    parts = [r for r in records if r["environment"] != ALL and (r["anomaly"] == ALL) == several]
-    saved = {(row_of(r), r["environment" if several else "anomaly"]): _saved(r) for r in parts}
-    names = in_order((name for _, name in saved), ENVIRONMENTS)
-    header = ["detector", "mean", "harm on nominal", "behind the best", *names]
+    saved: dict[str, dict[str, str]] = {}
+    for r in (r for r in records if r["environment"] != ALL and several == (r["anomaly"] == ALL)):
+        name = r["environment" if several else "anomaly"]
+        saved.setdefault(row_of(r), {})[name] = f"{_text(r, _SAVED)} ({_text(r, _PLACEBO)})"
+    names = in_order((name for of_row in saved.values() for name in of_row), ENVIRONMENTS)
     lines = []
     for r in rows:
-        row, mean = row_of(r), f"{_ends(r['intervention'][_SAVED])} ({_text(r, _PLACEBO)})"
-        behind = f"{_ends(test)}, p {test['p']:.2g}" if (test := r.get("behind")) else ""
-        of_names = (saved.get((row, name), "") for name in names)
-        lines.append([row, mean, _text(r, _HARM), behind, *of_names])
-    table = Table(f"Return saved by {act}, in brackets the placebo (%)", header, lines, wrap=True)
-    if not any(line[3] for line in lines):  # one row, or one of several environments
-        table = table.columns([i for i in range(len(header)) if i != 3])
-    title = f"What {act} prevents and costs (delay in rows, the rest in %)"
-    tables = [
-        table,
-        _table(title, rows, [*INTERVENTIONS][2:]),
-        *_useless(act, [r for r in cells if math.isnan(_value(r, _SAVED))]),
+        overall = [_ends(r["intervention"][_SAVED]), _text(r, _PLACEBO), _text(r, _HARM)]
+        lines.append([row_of(r), *overall, *(saved[row_of(r)].get(name, "") for name in names)])
+    behind = [
+        f"{row_of(r)} is {_ends(test)} behind {test['row']}, p {test['p']:.2g}"
+        for r in rows
+        if (test := r.get("behind"))
     ]
+    note = f"Paired by seeds: {'; '.join(behind)}." * bool(behind)
+    title = f"Return saved by {act}, in brackets the placebo (%)"
+    header = ["detector", "mean", "placebo", "harm on nominal", *names]
+    tables = [Table(title, header, lines, note=note, wrap=True)]
+    title = f"What {act} prevents and costs (delay in rows, the rest in %)"
+    tables.append(_table(title, rows, [*INTERVENTIONS][2:]))
+    tables += _useless(act, [r for r in cells if math.isnan(_value(r, _SAVED))])
     return Section(f"Acting by {act}", tables=tables, verdict=_verdict(act, rows[0]))
 
 
@@ -104,19 +100,16 @@ def _verdict(act: str, best: InterventionRecord) -> str:
 
 def _useless(act: str, cells: Records) -> list[Table]:
     """Return the table of faults that an act cannot mend, if there are any."""
-    lines: dict[tuple[str, str], dict[str, str]] = {}
+    rows, text = list(dict.fromkeys(map(row_of, cells))), COLUMNS[_HARM].text
+    lines: dict[tuple[str, ...], dict[str, str]] = {}
     for r in cells:
-        never, nominal = r["returns"]["never"], r["returns"]["twin"]
-        line = lines.setdefault((r["environment"], r["anomaly"]), {})
-        for name, lost in (
-            ("fault", nominal - never),
-            (row_of(r), never - r["returns"]["watchdog"]),
-        ):
-            line[name] = COLUMNS[_HARM].text(lost / abs(nominal))
-    header = list(dict.fromkeys(name for line in lines.values() for name in line))
-    texts = [[*labels, *(line.get(name, "") for name in header)] for labels, line in lines.items()]
+        twin, never, watchdog = (r["returns"][arm] for arm in ("twin", "never", "watchdog"))
+        place = r["environment"], r["anomaly"], text((twin - never) / abs(twin))
+        lines.setdefault(place, {})[row_of(r)] = text((never - watchdog) / abs(twin))
     title = f"Faults that {act} cannot mend: their cost, and that of acting (% of nominal return)"
-    return [Table(title, ["environment", "anomaly", *header], texts, 2, wrap=True)] * bool(cells)
+    texts = [[*labels, *(line.get(row, "") for row in rows)] for labels, line in lines.items()]
+    header = ["environment", "anomaly", "fault", *rows]
+    return [Table(title, header, texts, labels=2, wrap=True)] * bool(cells)
 
 
 def _table(title: str, rows: Records, names: Collection[str]) -> Table:
@@ -131,24 +124,19 @@ def _overall(records: Records) -> Records:
     return [r for r in whole if r["environment"] == ALL] or whole
 
 
-def _value(record: InterventionRecord, name: str) -> float:
+def _value(record: InterventionRecord, name: str, undefined: float = math.nan) -> float:
     value = record["intervention"][name]["value"]
-    return math.nan if value is None else float(value)
+    return undefined if value is None else float(value)
 
 
 def _text(record: InterventionRecord, name: str) -> str:
     return COLUMNS[name].text(_value(record, name))
 
 
-def _saved(record: InterventionRecord) -> str:
-    return f"{_text(record, _SAVED)} ({_text(record, _PLACEBO)})"
-
-
 def _ends(figure: Mapping[str, float | None]) -> str:
     """Return a share of the return saved with its interval."""
     numbers = (math.nan if (x := figure[end]) is None else x for end in ("value", "low", "high"))
-    value, low, high = map(COLUMNS[_SAVED].text, numbers)
-    return f"{value} [{low}, {high}]"
+    return "{} [{}, {}]".format(*map(COLUMNS[_SAVED].text, numbers))
 
 
 def write_pages(directory: Path, cells: Sequence[RawCell]) -> None:
@@ -157,14 +145,13 @@ def write_pages(directory: Path, cells: Sequence[RawCell]) -> None:
     lines = (json.dumps(record, sort_keys=True) + "\n" for record in records)
     write_text(directory / "records.jsonl", "".join(lines))
     write_text(directory / REPORT, "\n".join(map(markdown_section, sections(records))))
+    template = Template((_FILES / "page.html").read_text("utf-8"))
     for name in dict.fromkeys(cell["environment"] for cell in cells):
-        title, parts = escape(title_of(name)), [r for r in records if r["environment"] == name]
-        body = html_sections(sections(parts)) + f"<h3>Over time</h3><p>{_ARMS}</p>"
-        body += "".join(_figure(cell) for cell in cells if cell["environment"] == name)
-        head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width">'
-        head += f"<title>{title}</title><style>{(_STYLES / 'page.css').read_text('utf-8')}</style>"
-        page = f"<head>{head}</head><body><h2>What an alarm saves: {title}</h2>{body}</body>"
-        write_text(directory / f"{name}.html", f'<!doctype html>\n<html lang="en">{page}</html>\n')
+        tables = html_sections(sections([r for r in records if r["environment"] == name]))
+        drawn = [plot(cell) for cell in cells if cell["environment"] == name]
+        plots = (f'<div role="img" aria-label="{escape(words)}">{x}</div>' for x, words in drawn)
+        parts = {"title": escape(title_of(name)), "tables": tables, "plots": "\n".join(plots)}
+        write_text(directory / f"{name}.html", template.substitute(parts))
 
 
 def plot(cell: RawCell) -> tuple[str, str]:
@@ -180,26 +167,16 @@ def plot(cell: RawCell) -> tuple[str, str]:
     late = sorted(e["alarm"] - e["effect"] for e in alarmed if e["alarm"] >= e["effect"])
     title = f"{row_of(cell)}, {cell['anomaly']}, {cell['act']}"
     alarms = f"{len(late)} of {len(cell['episodes'])} episodes alarm"
-    shapes = [
-        label(LEFT, 16, title, "start", "bold"),
-        label(LEFT, 34, alarms, "start"),
-        *axes.ends(),
-    ]
-    shapes.append(axes.mark(0, 'class="effect"'))
-    if late:
-        shapes.append(axes.mark(late[len(late) // 2], 'class="alarm"'))
+    marks = [axes.mark(0, 'class="effect"')]
+    marks += [axes.mark(late[len(late) // 2], 'class="alarm"')] if late else []
+    texts = [label(LEFT, 16, title, "start", "bold"), label(LEFT, 34, alarms, "start")]
+    shapes = [f"<style>{(_FILES / 'plot.css').read_text('utf-8')}</style>", *axes.ends()]
     steps = [*range(0, size, -(-size // _POINTS)), size - 1]
     for i, (arm, line) in enumerate(gains.items()):
         shapes.append(axes.line(((first + step, line[step]) for step in steps), f'class="{arm}"'))
         x, y = LEFT + 130 * (i % 3), BOTTOM + 38 + 18 * (i // 3)
-        shapes += [f'<path class="{arm}" d="M{x} {y - 4}h18"/>', label(x + 24, y, arm, "start")]
-    style = f"<style>{(_STYLES / 'plot.css').read_text('utf-8')}</style>"
+        shapes.append(f'<path class="{arm}" d="M{x} {y - 4}h18"/>')
+        texts.append(label(x + 24, y, arm, "start"))
     ends = ", ".join(f"{arm} {line[-1]:.3g}" for arm, line in gains.items())
-    return svg(
-        WIDTH, BOTTOM + 66, [style, *shapes]
-    ), f"{title}: {alarms}; gained until the end: {ends}"
-
-
-def _figure(cell: RawCell) -> str:
-    drawing, text = plot(cell)
-    return f'<div class="plot" role="img" aria-label="{escape(text)}">{drawing}</div>'
+    words = f"{title}: {alarms}; gained until the end: {ends}"
+    return svg(WIDTH, BOTTOM + 66, [*shapes, *marks, *texts]), words

@@ -40,8 +40,8 @@ def test_tables_are_printed_and_files_written(calls, tmp_path, capsys):
     assert (settings["parameters"], settings["acts"], settings["seeds"]) == ({"a": 1}, "mask", 3)
     out = capsys.readouterr().out
     first, *lines = out.splitlines()
-    assert "1/3 cells" in first
-    assert "3/3 cells" in lines[0]
+    assert first == "1/3  hopper/panel fitted"
+    assert lines[0] == "3/3  hopper/iid"
     assert lines[1].startswith("The alarm of panel is worth having")
     assert "Return saved by mask" in out
     assert str(tmp_path) in lines[-1].replace("\n", "")
@@ -102,7 +102,7 @@ def test_a_study_of_cartpole_runs_and_goes_on(tmp_path, capsys):
     words += ["--output", str(tmp_path)]
     assert main(words) == 0
     first = capsys.readouterr().out
-    assert "2/2 cells" in first
+    assert "2/2  cartpole" in first
     before = {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*.json")}
     assert len(before) == 2
     assert main(words) == 0

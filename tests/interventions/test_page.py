@@ -60,17 +60,16 @@ def test_detectors_are_rows_and_environments_columns():
     parts = sections(records_of(cells("riqn", "panel", "rf")))
     rows = table(parts, "Return saved by mask")
     assert [row["detector"] for row in rows] == ["riqn", "panel", "rf"]
-    assert [*rows[0]] == ["detector", "mean", "harm on nominal", "behind the best",
-                          "cartpole", "hopper"]  # fmt: skip
+    assert [*rows[0]] == ["detector", "mean", "placebo", "harm on nominal", "cartpole", "hopper"]
     assert rows[0]["hopper"] == "77.4 (12.9)"
-    assert rows[0]["behind the best"] == ""
-    assert rows[1]["behind the best"].startswith("25.8 [")
-    assert rows[2]["harm on nominal"] == "10.0"
+    assert (rows[2]["placebo"], rows[2]["harm on nominal"]) == ("12.9", "10.0")
+    behind = re.findall(r"(\w+) is ([\d.]+) \[[^]]*\] behind riqn, p", parts[0].tables[0].note)
+    assert behind == [("panel", "25.8"), ("rf", "51.6")]
 
 
 def test_with_one_environment_kinds_are_columns():
     rows = table(sections(records_of(cells("panel", environments=["hopper"]))), "Return saved")
-    assert [*rows[0]] == ["detector", "mean", "harm on nominal", "drift", "iid"]
+    assert [*rows[0]] == ["detector", "mean", "placebo", "harm on nominal", "drift", "iid"]
     assert rows[0]["drift"] == "\N{EN DASH} (\N{EN DASH})"
 
 
