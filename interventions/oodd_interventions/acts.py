@@ -123,7 +123,7 @@ class Compensated:
     little on its own.
     """
 
-    common, own = 0.3, 0.03
+    common, single = 0.3, 0.03
     """Prior standard deviations of the pushes, in units of the command."""
     least = 0.1
     """A smaller push is left alone: weaker motors and heavier bodies look like one."""
@@ -136,7 +136,7 @@ class Compensated:
         latest, before = model.coefficients[2 * d : 2 * d + a], model.coefficients[-1 - a : -1]
         self._effects = (latest + before) / model.actions.std[:, None]
         self._weight = np.linalg.inv(model.covariance)
-        self._precision = np.linalg.inv(self.own**2 * np.eye(a) + self.common**2)
+        self._precision = np.linalg.inv(self.single**2 * np.eye(a) + self.common**2)
         self._evidence = np.zeros(a)
         self._seen = situation.onset
 
@@ -154,9 +154,9 @@ class Compensated:
 
     def _learn(self, error: NDArray[np.float64]) -> None:
         size = error @ self._weight @ error / len(error)
-        told = (self.freedom + 1) / (self.freedom + size) * self._effects @ self._weight
-        self._precision += told @ self._effects.T
-        self._evidence += told @ error
+        gain = (self.freedom + 1) / (self.freedom + size) * self._effects @ self._weight
+        self._precision += gain @ self._effects.T
+        self._evidence += gain @ error
 
 
 def _of(name: str, make: Callable[[Situation], Act], summary: str, *names: str) -> ActSpec:

@@ -1,4 +1,4 @@
-"""Acts of the worlds: their controllers go on, and are shown another way to follow."""
+"""Acts of the worlds: their controllers go on, and follow another way."""
 
 from collections.abc import Callable
 from functools import partial
@@ -21,7 +21,7 @@ SAFE_LEVELS: Final = (6.0, 6.0)
 """Set points in cm: half of the usual ones, far from both ends of the tanks."""
 
 
-class Shown:
+class Steered:
     """The policy goes on, with rows that `change` has written into."""
 
     def __init__(self, policy: Policy, change: Callable[[Row], None]) -> None:
@@ -34,37 +34,37 @@ class Shown:
         return self._policy.act(changed)
 
 
-def hold(situation: Situation) -> Shown:
+def hold(situation: Situation) -> Steered:
     """Hold the arm at the angles of the alarm's row."""
     angles = situation.rows[-1, :6].copy()
 
     def change(row: Row) -> None:
         row[ARM_WAY], row[18:] = angles, 0.0
 
-    return Shown(situation.policy, change)
+    return Steered(situation.policy, change)
 
 
-def land(situation: Situation) -> Shown:
+def land(situation: Situation) -> Steered:
     """Let the drone come down where it is to the height 0, and stay there."""
-    place = situation.rows[-1, :3].copy()
+    target = situation.rows[-1, :3].copy()
 
     def change(row: Row) -> None:
-        place[2] = max(0.0, place[2] - DESCENT * PERIOD)
-        row[DRONE_WAY], row[15:] = place, (0.0, 0.0, -DESCENT if place[2] else 0.0)
+        target[2] = max(0.0, target[2] - DESCENT * PERIOD)
+        row[DRONE_WAY], row[15:] = target, (0.0, 0.0, -DESCENT if target[2] else 0.0)
 
-    return Shown(situation.policy, change)
+    return Steered(situation.policy, change)
 
 
-def drain(situation: Situation) -> Shown:
+def drain(situation: Situation) -> Steered:
     """Let the levels of the tanks go to their fail-safe set points."""
 
     def change(row: Row) -> None:
         row[4:] = SAFE_LEVELS
 
-    return Shown(situation.policy, change)
+    return Steered(situation.policy, change)
 
 
-def integral(way: slice, rate: float, situation: Situation) -> Shown:
+def integral(way: slice, rate: float, situation: Situation) -> Steered:
     """Add an integral of the error to a controller: `rate` in 1/s."""
     measured = slice(way.stop - way.start)
     total = np.zeros(way.stop - way.start)
@@ -73,16 +73,16 @@ def integral(way: slice, rate: float, situation: Situation) -> Shown:
         total[:] += rate * PERIOD * (row[way] - row[measured])
         row[way] += total
 
-    return Shown(situation.policy, change)
+    return Steered(situation.policy, change)
 
 
-def stiffen(factor: float, situation: Situation) -> Shown:
+def stiffen(factor: float, situation: Situation) -> Steered:
     """Multiply the gains of the tanks' controllers."""
 
     def change(row: Row) -> None:
         row[:2] = row[4:] - factor * (row[4:] - row[:2])
 
-    return Shown(situation.policy, change)
+    return Steered(situation.policy, change)
 
 
 def _of(name: str, make: Callable[[Situation], Act], summary: str, world: str) -> ActSpec:
