@@ -31,6 +31,8 @@ FREEDOM: Final = 4.0  # of the errors' Student t distribution: contacts make hea
 STEPS: Final = 10  # in which the errors' covariance is found
 STEP: Final = 2.0  # limit of an error's logarithm in the CUSUM that finds the onset
 LIMIT: Final = 100.0  # of a reading that a fault is proportional to, in standard deviations
+JUMP: Final = 10.0  # of an error over all since the onset that makes it the onset
+ROWS: Final = 30_000  # that a fit takes, at most about
 WINDOW: Final = 8  # rows from the onset on that a naming looks at
 SIZES: Final = np.array([0.03, 0.1, 0.3, 1.0, 3.0])  # of faults, in standard deviations
 LARGEST: Final = 0.4  # share of the sensors in a set
@@ -38,7 +40,7 @@ DISTINCT: Final = 8  # a sensor with as few values tells contacts or modes: it i
 
 # Prices in nats of evidence.
 PRICE: Final = 2.0  # of a part
-FIRST: Final = 2.5  # of a set, times the logarithm of the number of sensors: the best is of many
+FIRST: Final = 4.0  # of a set, times the logarithm of the number of sensors: the best is of many
 NEVER: Final = 1e9
 
 
@@ -69,6 +71,7 @@ class ReadingModel:
     @classmethod
     def with_errors(cls, nominal: Sequence[Trajectory]) -> tuple[Self, Floats]:
         """Return a fit, and the errors of forecasts that were fitted to other episodes, (N, D)."""
+        nominal = _some(nominal)
         sensors = _scale([x.observations for x in nominal])
         actions = _scale([x.actions for x in nominal])
         bare = cls(sensors, actions, np.empty((0, 0)), np.empty((0, 0)))
@@ -126,6 +129,7 @@ class PartNamer:
     @classmethod
     def fit(cls, nominal: Sequence[Trajectory]) -> Self:
         """Fit to nominal episodes; actions are used where episodes have them."""
+        nominal = _some(nominal)
         model, errors = ReadingModel.with_errors(nominal)
         lengths = _squares(errors, np.linalg.inv(model.covariance))
         reference = float(np.sqrt(np.quantile(lengths, 0.9))) or 1.0
@@ -203,7 +207,7 @@ class LiveNaming:
 
     def __init__(self, namer: PartNamer, since: int) -> None:
         self._namer, self._since, self._t = namer, since, -1
-        self._runs, self._sum, self._onset = np.zeros_like(namer.runs), 0.0, 0
+        self._runs, self._sum, self._largest, self._onset = np.zeros_like(namer.runs), 0.0, 0.0, 0
         self._window: list[tuple[Floats, Floats]] = []
         self._precision = namer.evidence[0].precision
 
@@ -225,10 +229,11 @@ class LiveNaming:
 
     def _follow(self, error: Floats, shape: Floats) -> None:
         """Find the onset with a CUSUM, and keep the first rows from there on."""
-        if self._sum <= 0 or self._t <= self._since:
-            self._sum, self._onset, self._window = 0.0, self._t, []
-        length = np.sqrt(_squares(error[None], self._precision)[0]) / self._namer.reference
-        self._sum += float(np.clip(np.log(np.maximum(length, 1e-9)), -STEP, STEP))
+        length = float(np.sqrt(_squares(error[None], self._precision)[0])) / self._namer.reference
+        if self._sum <= 0 or self._t <= self._since or length > JUMP * self._largest:
+            self._sum, self._largest, self._onset, self._window = 0.0, 1e-9, self._t, []
+        self._largest = max(self._largest, length)
+        self._sum += float(np.clip(np.log(max(length, 1e-9)), -STEP, STEP))
         if len(self._window) < WINDOW:
             self._window.append((error, shape))
 
@@ -357,6 +362,12 @@ class _Search(NamedTuple):
         moments, form = mean[:, :, None] * mean[:, None] + blocks, self.form[members]
         sizes[members] = np.sqrt(np.einsum("mab,mai,mbi->mi", moments, form, form).mean(axis=1))
         return value, 1 / (1 + np.exp(-np.clip(worth, -50, 50))), sizes
+
+
+def _some(nominal: Sequence[Trajectory]) -> list[Trajectory]:
+    """Return episodes evenly, and the beginning of long ones, so that they have few rows."""
+    step = max(1, round(sum(map(len, nominal)) / ROWS))
+    return [x if len(x) <= ROWS else x[:ROWS] for x in nominal[::step]]
 
 
 def _longest(rows: NDArray[np.float32]) -> Floats:
