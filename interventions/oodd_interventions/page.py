@@ -104,8 +104,8 @@ def _useless(act: str, cells: Records) -> list[Table]:
     lines: dict[tuple[str, ...], dict[str, str]] = {}
     for r in cells:
         twin, never, watchdog = (r["returns"][arm] for arm in ("twin", "never", "watchdog"))
-        place = r["environment"], r["anomaly"], text((twin - never) / abs(twin))
-        lines.setdefault(place, {})[row_of(r)] = text((never - watchdog) / abs(twin))
+        fault = r["environment"], r["anomaly"], text((twin - never) / abs(twin))
+        lines.setdefault(fault, {})[row_of(r)] = text((never - watchdog) / abs(twin))
     title = f"Faults that {act} cannot mend: their cost, and that of acting (% of nominal return)"
     texts = [[*labels, *(line.get(row, "") for row in rows)] for labels, line in lines.items()]
     header = ["environment", "anomaly", "fault", *rows]
