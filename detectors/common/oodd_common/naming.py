@@ -41,6 +41,7 @@ DISTINCT: Final = 8  # a sensor with as few values tells contacts or modes: it i
 # Prices in nats of evidence.
 PRICE: Final = 2.0  # of a part
 FIRST: Final = 4.0  # of a set, times the logarithm of the number of sensors: the best is of many
+DYNAMIC: Final = 2.0  # of a set of actuators, where sensors do not explain the errors
 NEVER: Final = 1e9
 
 
@@ -254,9 +255,10 @@ class LiveNaming:
             most, price = max(1, int(LARGEST * d)), namer.price
             readings = namer.evidence[0].best(errors, shapes[:, :d], price[:d], most)
             commands = namer.evidence[1].best(errors, shapes[:, d:], price[d:], len(actuators))
-            if max(readings[0], commands[0]) <= FIRST * np.log(1 + d):
+            of_sensors, of_actuators = readings[0] - FIRST * np.log(1 + d), commands[0] - DYNAMIC
+            if max(of_sensors, of_actuators) <= 0:
                 kind = "body"
-            elif readings[0] >= commands[0]:
+            elif of_sensors >= of_actuators:
                 (_, sensors, sizes), kind = readings, "sensor"
             elif (commands[1] >= 0.5).sum() > 1:
                 kind = "environment"  # such as wind, which moves all joints
