@@ -11,6 +11,7 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from operator import itemgetter
 from typing import Any, Final, NamedTuple, Self, TypeAlias
 
 import numpy as np
@@ -22,13 +23,12 @@ from oodd_eval import Naming, Trajectory
 from oodd_eval.plugins.forecasting import CONSTANT, FeatureScale
 from oodd_eval.plugins.state import Arrays, take
 
-ORDER: Final = 2
-"""Latest rows, and commands, that a forecast uses."""
+ORDER: Final = 2  # latest rows, and commands, that a forecast uses
 RIDGE: Final = 1e-6  # relative to the mean square of a standardized sensor
 FOLDS: Final = 5  # of episodes, each forecast by what was fitted on the others
 FLOOR: Final = 3e-3  # least standard deviation of an error, in those of training
 FREEDOM: Final = 4.0  # of the errors' Student t distribution: contacts make heavy tails
-STEPS: Final = 10  # in which the errors' covariance is found
+STEPS: Final = 10  # in which the errors' covariance is fitted
 STEP: Final = 2.0  # limit of an error's logarithm in the CUSUM that finds the onset
 LIMIT: Final = 100.0  # of a reading that a fault is proportional to, in standard deviations
 JUMP: Final = 10.0  # of an error over all since the onset that makes it the onset
@@ -43,6 +43,8 @@ PRICE: Final = 2.0  # of a part
 FIRST: Final = 4.0  # of a set, times the logarithm of the number of sensors: the best is of many
 DYNAMIC: Final = 2.0  # of a set of actuators, where sensors do not explain the errors
 NEVER: Final = 1e9
+
+NAMES: Final = ["sensors", "actions", "coefficients", "covariance", "price", "runs", "reference"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,29 +171,22 @@ class PartNamer:
 
     def arrays(self) -> dict[str, Floats]:
         """Return the fit as arrays of numbers, by name."""
-        model = self.model
-        return {
-            "naming_sensors": np.stack([model.sensors.mean, model.sensors.std]),
-            "naming_actions": np.stack([model.actions.mean, model.actions.std]),
-            "naming_coefficients": model.coefficients,
-            "naming_covariance": model.covariance,
-            "naming_price": self.price,
-            "naming_runs": self.runs,
-            "naming_reference": np.array([self.reference]),
-        }
+        model, reference = self.model, np.array([self.reference])
+        scales = [np.stack([s.mean, s.std]) for s in (model.sensors, model.actions)]
+        fit = *scales, model.coefficients, model.covariance, self.price, self.runs, reference
+        return {f"naming_{name}": array for name, array in zip(NAMES, fit, strict=True)}
 
     @classmethod
     def of(cls, arrays: Arrays) -> Self:
         """Return the fit among saved arrays; `FittedStateError` where there is none."""
-        sensors = FeatureScale.of(arrays, "naming_sensors")
-        actions = FeatureScale.of(arrays, "naming_actions")
-        d, a = len(sensors.mean), len(actions.mean)
-        coefficients = take(arrays, "naming_coefficients", (ORDER * (d + a) + 1, d))
-        model = ReadingModel(
-            sensors, actions, coefficients, take(arrays, "naming_covariance", (d, d))
+        sensors, actions = (FeatureScale.of(arrays, f"naming_{name}") for name in NAMES[:2])
+        d, parts = len(sensors.mean), len(sensors.mean) + len(actions.mean)
+        forms = (ORDER * parts + 1, d), (d, d), (parts,), (2, d), (1,)
+        *fit, price, runs, reference = (
+            take(arrays, f"naming_{name}", form)
+            for name, form in zip(NAMES[2:], forms, strict=True)
         )
-        price, runs = take(arrays, "naming_price", (d + a,)), take(arrays, "naming_runs", (2, d))
-        return cls(model, price, runs, float(take(arrays, "naming_reference", (1,), "+")[0]))
+        return cls(ReadingModel(sensors, actions, *fit), price, runs, float(reference[0]))
 
     @cached_property
     def evidence(self) -> tuple[_Evidence, _Evidence]:
@@ -267,8 +262,8 @@ class LiveNaming:
         return Naming(sensors, actuators, sizes * namer.model.sensors.std, kind), onset
 
 
+# A set of parts: its evidence beyond prices, and each part's probability and size, (P,).
 _Set: TypeAlias = tuple[float, Floats, Floats]
-"""A set of parts: its evidence beyond prices, and each part's probability and size, (P,)."""
 
 
 class _Evidence:
@@ -299,7 +294,7 @@ class _Evidence:
             blocks = np.einsum("pai,piqj,qbj->paqb", form, gram, form, optimize=True)
             pulls = np.einsum("pai,pi->pa", form, pull)
             sets.append(_Search(blocks, pulls, form, price, square, errors.size).best(most))
-        return max(sets, key=lambda found: found[0])
+        return max(sets, key=itemgetter(0))
 
 
 class _Search(NamedTuple):
@@ -326,7 +321,7 @@ class _Search(NamedTuple):
         blocks = np.einsum("pipj->pij", self.gram)[None].repeat(len(SIZES), axis=0)
         pulls, columns = np.tile(self.pull, (len(SIZES), 1, 1)), list[Floats]()
         joined, value = np.zeros((len(SIZES), parts), dtype=bool), np.zeros(len(SIZES))
-        square, found = np.full((len(SIZES), 1), self.square), (-np.inf, every[:0], value, 1.0)
+        square, best_set = np.full((len(SIZES), 1), self.square), (-np.inf, every[:0], value, 1.0)
         for step in range(most + 1):
             root = np.linalg.inv(np.linalg.cholesky(blocks + prior))
             seen = (root @ pulls[..., None])[..., 0]
@@ -334,8 +329,8 @@ class _Search(NamedTuple):
             cost = self.price - np.log(scales / sizes).sum(axis=2)
             worth = self.density(square - squares) - self.density(square) - cost
             g = int(value.argmax())
-            if value[g] > found[0]:
-                found = float(value[g]), np.flatnonzero(joined[g]), worth[g], float(SIZES[g])
+            if value[g] > best_set[0]:
+                best_set = float(value[g]), np.flatnonzero(joined[g]), worth[g], float(SIZES[g])
             if step == most:
                 break
             part = np.where(joined, -np.inf, 0.5 * squares - cost).argmax(axis=1)
@@ -347,7 +342,7 @@ class _Search(NamedTuple):
             columns.append(column @ root[every, part].transpose(0, 2, 1)[:, None])
             pulls = pulls - (columns[-1] @ seen[every, part][:, None, :, None])[..., 0]
             blocks = blocks - columns[-1] @ columns[-1].transpose(0, 1, 3, 2)
-        return self._judged(*found)
+        return self._judged(*best_set)
 
     def _judged(self, value: float, members: NDArray[Any], worth: Floats, size: float) -> _Set:
         """Return a set with what each member is worth beside the others, and its size."""
