@@ -238,8 +238,10 @@ def test_a_fit_is_deterministic_and_its_model_is_that_of_readings(namer):
     again = PartNamer.fit([episode(seed) for seed in range(12)])
     for name, array in namer.arrays().items():
         np.testing.assert_array_equal(array, again.arrays()[name])
-    model = ReadingModel.fit([episode(seed) for seed in range(12)])
+    model = ReadingModel.with_errors([episode(seed) for seed in range(12)])[0]
     np.testing.assert_array_equal(model.coefficients, namer.model.coefficients)
+    fed_back = ReadingModel.fit([episode(seed) for seed in range(12)])
+    assert (np.abs(fed_back.coefficients) ** 2).sum() < (np.abs(model.coefficients) ** 2).sum()
     forecast = model.coefficients[: 2 * D].reshape(2, D, D)[0]
     states_per_unit = UNITS / model.sensors.std
     expected = DYNAMICS * states_per_unit / states_per_unit[:, None]

@@ -25,6 +25,7 @@ from oodd_eval.plugins.state import Arrays, take
 
 ORDER: Final = 2  # latest rows, and commands, that a forecast uses
 RIDGE: Final = 1e-6  # relative to the mean square of a standardized sensor
+FED_BACK: Final = 1e-4  # the same of forecasts that are fed back, as a virtual sensor's are
 FOLDS: Final = 5  # of episodes, each forecast by what was fitted on the others
 FLOOR: Final = 3e-3  # least standard deviation of an error, in those of training
 FREEDOM: Final = 4.0  # of the errors' Student t distribution: contacts make heavy tails
@@ -69,10 +70,12 @@ class ReadingModel:
     @classmethod
     def fit(cls, nominal: Sequence[Trajectory]) -> Self:
         """Fit to nominal episodes; those without actions have forecasts without commands."""
-        return cls.with_errors(nominal)[0]
+        return cls.with_errors(nominal, FED_BACK)[0]
 
     @classmethod
-    def with_errors(cls, nominal: Sequence[Trajectory]) -> tuple[Self, Floats]:
+    def with_errors(
+        cls, nominal: Sequence[Trajectory], ridge: float = RIDGE
+    ) -> tuple[Self, Floats]:
         """Return a fit, and the errors of forecasts that were fitted to other episodes, (N, D)."""
         nominal = _some(nominal)
         sensors = _scale([x.observations for x in nominal])
@@ -80,11 +83,11 @@ class ReadingModel:
         bare = cls(sensors, actions, np.empty((0, 0)), np.empty((0, 0)))
         pairs = [(bare.regressors(x), bare.standard(x)[1:]) for x in nominal]
         fits = [
-            _ridge([pair for j, pair in enumerate(pairs) if j % FOLDS != i] or pairs)
+            _ridge([pair for j, pair in enumerate(pairs) if j % FOLDS != i] or pairs, ridge)
             for i in range(min(FOLDS, len(pairs)))
         ]
         errors = np.concatenate([y - x @ fits[i % FOLDS] for i, (x, y) in enumerate(pairs)])
-        return cls(sensors, actions, _ridge(pairs), _covariance(errors)), errors
+        return cls(sensors, actions, _ridge(pairs, ridge), _covariance(errors)), errors
 
     def standard(self, x: Trajectory) -> Floats:
         """Return the standardized rows of an episode, (T + 1, D)."""
@@ -387,10 +390,10 @@ def _scale(arrays: Sequence[NDArray[np.float32]]) -> FeatureScale:
     return FeatureScale(rows.mean(axis=0), np.where(std < CONSTANT, 1.0, std))
 
 
-def _ridge(pairs: Sequence[tuple[Floats, Floats]]) -> Floats:
+def _ridge(pairs: Sequence[tuple[Floats, Floats]], ridge: float) -> Floats:
     """Return the coefficients of a ridge regression, whose constant goes unpunished."""
     gram = np.sum([x.T @ x for x, _ in pairs], axis=0)
-    penalty = np.full(len(gram), RIDGE * gram[-1, -1])
+    penalty = np.full(len(gram), ridge * gram[-1, -1])
     penalty[-1] = 0.0
     return np.asarray(
         np.linalg.solve(gram + np.diag(penalty), np.sum([x.T @ y for x, y in pairs], axis=0))
