@@ -95,8 +95,11 @@ def columns(episodes):
         recall = np.mean([h / len(e["faulty"]) for h, e in zip(hits, episodes, strict=True)])
         cells.append(f"{100 * recall:.0f} / {100 * sum(hits) / max(count, 1):.0f}")
     means = [100 * np.mean([e[key] for e in episodes]) for key in ("chance", "largest", "kind")]
+    chance, largest, kind = (f"{mean:.0f}" for mean in means)
+    if not all(e["faulty"] for e in episodes):
+        chance = largest = ""
     onset = f"{np.median([e['onset'] for e in episodes]):.0f}"
-    return [len(episodes), *cells, *(f"{m:.0f}" for m in means[:2]), onset, f"{means[2]:.0f}"]
+    return [len(episodes), *cells, chance, largest, onset, kind]
 
 
 def table_of(environment, split, detector_name, level, kept):
@@ -108,11 +111,12 @@ def table_of(environment, split, detector_name, level, kept):
     rows = []
     for condition in split.conditions(environment):
         test, episodes = data.anomalous(condition), []
+        group = split.groups[condition.anomaly]
         for x, effect, parameters in zip(test, test.effects, test.parameters, strict=True):
             above = rule.statistic(detector.score(x)) > rule.threshold
             alarms = np.flatnonzero(above[effect:]) + effect
             if len(alarms):
-                fact = measured(namer, x, int(alarms[0]), int(effect), parameters, test.group)
+                fact = measured(namer, x, int(alarms[0]), int(effect), parameters, group)
                 episodes.append(fact)
         if episodes:
             rows.append([environment, str(condition), *columns(episodes)])
