@@ -117,7 +117,8 @@ class Study:
 
     def fit_file(self, unit: Unit) -> Path:
         """Return the file of a detector's fit and alarm."""
-        name = f"{_plain_name(unit)}-{unit.fit_key}-{100 * self.level:g}.npz"
+        # The alarm's threshold is of scores, which more parameters decide than a fit.
+        name = f"{unit.scores_key}-{100 * self.level:g}.npz"
         return self.output / "fits" / unit.environment / name
 
 

@@ -90,6 +90,19 @@ def test_an_interrupted_study_goes_on_and_has_the_same_files(whole, split, tmp_p
     assert later[-1] == (4, 4)
 
 
+@pytest.mark.slow
+def test_a_threshold_is_not_taken_from_a_study_with_other_scores(split, tmp_path):
+    """The weight decides the scores of `rf-ewma`, but not its fit."""
+    settings = STUDY | {"kinds": "iid", "seeds": 2, "split": split}
+    forest = {"members": 2, "trees": 1}
+    alarms = []
+    for directory, weight in (("a", 0.03), ("a", 1.0), ("b", 1.0)):
+        output, values = tmp_path / directory, forest | {"weight": weight}
+        study = intervene("rf-ewma", "cartpole", output=output, parameters=values, **settings)
+        alarms.append([(e["alarm"], e["false_alarm"]) for e in study.cells[0]["episodes"]])
+    assert alarms[0] != alarms[1] == alarms[2]
+
+
 PLUGIN = """
 from oodd_interventions import ActSpec
 
