@@ -37,7 +37,7 @@ from oodd_eval.data.files import only_writer, write_text
 from oodd_eval.data.parts import EnvironmentData
 from oodd_eval.data.registry import register
 from oodd_eval.data.split import Split, load_split
-from oodd_eval.errors import SimulationError, UsageError
+from oodd_eval.errors import SimulationError, UnknownNameError, UsageError
 from oodd_eval.metrics.alarms import Calibration, GuaranteedAlarm
 from oodd_eval.metrics.cusum import Standardization
 from oodd_eval.names import select
@@ -88,7 +88,8 @@ class Interventions:
     cells
         Raw cells as the files have them, in the order environments x conditions x acts x detectors.
     reasons
-        Why a cell is missing, by ``ENV/DETECTOR`` or ``ENV/DETECTOR/CONDITION--ACT``.
+        Why a cell is missing, by ``ENV/DETECTOR`` or ``ENV/DETECTOR/CONDITION--ACT``, and what is
+        wrong with broken plug-ins.
     """
 
     output: Path
@@ -226,7 +227,8 @@ def intervene(
         parameters=parameters,
     )
     offered = offered_acts(plugins)
-    act_names = select("act", _listed(acts or "all"), dict.fromkeys(act.name for act in offered))
+    broken = {f"plug-in {b.plugin!r} of {b.distribution}": b.reason for b in plugins.broken}
+    act_names = _selected(_listed(acts or "all"), offered, broken)
     study = Study(opened.path, Path(output), seeds, base, level)
     cells = [
         StudyCell(study, unit, plan.blank(unit, condition, status="ok"), act)
@@ -238,7 +240,7 @@ def intervene(
         for cell in cells if fresh else ():
             for file in (cell.file, study.fit_file(cell.unit)):
                 file.unlink(missing_ok=True)
-        reasons = _run(cells, jobs, observer)
+        reasons = broken | _run(cells, jobs, observer)
     done = (cell.read() for cell in cells)
     return Interventions(study.output, [cell for cell in done if cell is not None], reasons)
 
@@ -251,6 +253,17 @@ def offered_acts(plugins: Plugins) -> list[ActSpec]:
         with plugins.blaming(plugin.point):
             acts += plugin.listed("oodd_acts", ActSpec)
     return acts
+
+
+def _selected(names: str, offered: Sequence[ActSpec], broken: Mapping[str, str]) -> list[str]:
+    """Return the names of acts; those that nobody offers may be a broken plug-in's."""
+    try:
+        return select("act", names, dict.fromkeys(act.name for act in offered))
+    except UnknownNameError as error:
+        if broken:
+            plugins = "; ".join(f"{plugin}: {reason}" for plugin, reason in broken.items())
+            raise UsageError(f"{error}; broken is {plugins}") from error
+        raise
 
 
 def suiting(
@@ -272,8 +285,9 @@ def _run(cells: Sequence[StudyCell], jobs: int | None, observer: Progress) -> di
             units = {_name_of(cell.unit): (cell.study, cell.unit) for cell in missing}
             fits = {pool.submit(fit, *units[name]): name for name in units}
             for future in as_completed(fits):
-                reasons |= _failure(future, fits[future])
-                observer(done, len(cells), f"{fits[future]} fitted")
+                failure = _failure(future, fits[future])
+                observer(done, len(cells), f"{fits[future]} {'failed' if failure else 'fitted'}")
+                reasons |= failure
             batches: dict[str, list[StudyCell]] = {}
             for cell in missing:
                 if _name_of(cell.unit) not in reasons:

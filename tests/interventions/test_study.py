@@ -156,6 +156,23 @@ def test_wrong_names_and_the_base_of_the_split_are_refused(split, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+BROKEN = """
+@hookimpl
+def oodd_acts():
+    return ["brake"]
+"""
+
+
+def test_acts_of_a_broken_plugin_are_not_passed_over_in_silence(split, tmp_path, monkeypatch):
+    install(monkeypatch, tmp_path / "plugin", "braking", BROKEN)
+    settings = {"split": split, "output": tmp_path / "study", "seeds": 1, "jobs": 1}
+    with pytest.raises(UsageError, match="unknown act 'brake'.*plug-in 'braking'.*'brake'"):
+        intervene("mahalanobis", "cartpole", acts="brake", **settings)
+    study = intervene("mahalanobis", "cartpole", acts="mask", kinds="wind-l2r", **settings)
+    [plugin] = study.reasons
+    assert plugin.startswith("plug-in 'braking'")
+
+
 def test_an_act_of_the_environment_takes_the_place_of_a_general_one():
     general = ActSpec("stop", None, "", ("sensor", "dynamics"))
     special = ActSpec("stop", None, "", ("dynamics",), ("cartpole",))
