@@ -17,6 +17,7 @@ from oodd_recording.registered import info_of
 
 from oodd_eval.data.facts import Group
 from oodd_eval.data.trajectory import Trajectory
+from oodd_eval.errors import ContractError
 from oodd_eval.metrics.alarms import GuaranteedAlarm
 from oodd_eval.plugins.explanations import Naming, checked_explanation, explains, naming_of
 from oodd_interventions.acts import failed
@@ -177,8 +178,26 @@ class _TakingOver:
             if named is not None:
                 self._situation.naming, self._situation.onset = named
         action = self._acting.act(row)
-        self._actions[t] = np.eye(len(actions.T))[action] if self._info.discrete else action
+        self._actions[t] = self._command(action, t)
         return action
+
+    def _command(self, action: Any, t: int) -> NDArray[np.float64]:
+        """Return a command as trajectories have it; `ContractError` where it is none."""
+        width, values = self._info.action_dim, np.ravel(action)
+        if self._info.discrete:
+            expected = f"a whole number from 0 to {width - 1}"
+            fine = np.ndim(action) == 0 and np.isin(action, range(width)).all()
+        else:
+            expected = f"{width} finite number(s)"
+            fine = values.shape == (width,) and values.dtype.kind in "fiu"
+            fine = fine and np.isfinite(values).all()
+        if not fine:
+            act, environment = self._spec.name, self._loop.setup.environment
+            raise ContractError(
+                f"act {act!r} of {environment} returned {action!r:.80} for row {t}: "
+                f"expected {expected}"
+            )
+        return np.eye(width)[int(action)] if self._info.discrete else values
 
 
 def run_cell(

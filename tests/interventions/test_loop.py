@@ -15,6 +15,7 @@ from oodd_recording.closed_loop import Setup, record_again, record_anomalous, re
 from oodd_recording.policies import CustomPolicy, load_policy
 
 from oodd_eval import Explanation, Naming
+from oodd_eval.errors import ContractError
 from oodd_eval.metrics.alarms import GuaranteedAlarm
 
 CAP = 120
@@ -157,6 +158,13 @@ def constant(action):
             return action
 
     return ActSpec("constant", Constant, "the same command", ("sensor", "dynamics"))
+
+
+@pytest.mark.parametrize("action", [2, -1, 0.5, math.nan, None, "left", [0, 1], np.zeros(3)])
+def test_an_act_that_returns_no_command_is_told_what_one_is(loop, pairs, action):
+    pair = pairs["iid"][0]
+    with pytest.raises(ContractError, match=r"'constant' of cartpole returned .* from 0 to 1"):
+        loop.arm(pair, constant(action), 5, lambda *_: pair.truth())
 
 
 def test_a_detector_that_never_alarms_has_exactly_never(loop, pairs):

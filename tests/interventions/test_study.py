@@ -166,7 +166,7 @@ def oodd_acts():
 def test_acts_of_a_broken_plugin_are_not_passed_over_in_silence(split, tmp_path, monkeypatch):
     install(monkeypatch, tmp_path / "plugin", "braking", BROKEN)
     settings = {"split": split, "output": tmp_path / "study", "seeds": 1, "jobs": 1}
-    with pytest.raises(UsageError, match="unknown act 'brake'.*plug-in 'braking'.*'brake'"):
+    with pytest.raises(UsageError, match=r"unknown act 'brake'.*plug-in 'braking'.*'brake'"):
         intervene("mahalanobis", "cartpole", acts="brake", **settings)
     study = intervene("mahalanobis", "cartpole", acts="mask", kinds="wind-l2r", **settings)
     [plugin] = study.reasons
