@@ -15,6 +15,7 @@ from oodd_recording.svg import BOTTOM, LEFT, WIDTH, Axes, label, svg
 from oodd_eval.data.facts import ENVIRONMENTS, in_order, title_of
 from oodd_eval.data.files import write_text
 from oodd_eval.metrics.catalogue import INTERVENTIONS
+from oodd_eval.names import counted
 from oodd_eval.prose import Section, Table
 from oodd_eval.results.render.text import html_sections, markdown_section
 from oodd_interventions.columns import (
@@ -34,6 +35,7 @@ REPORT: Final = "report.md"
 
 _SAVED, _PLACEBO, _HARM = "return_saved", "placebo_saved", "harm_on_nominal"
 _POINTS: Final = 200  # of a line in a plot, about
+_FEWEST: Final = 5  # seeds that can show something: a coin falls alike five times in 6 %
 _FILES: Final = files("oodd_interventions")
 
 
@@ -81,15 +83,21 @@ def _of_act(act: str, records: Records) -> Section:
     title = f"What {act} prevents and costs (delay in rows, the rest in %)"
     tables.append(_table(title, rows, [*INTERVENTIONS][2:]))
     tables += _useless(act, [r for r in cells if math.isnan(_value(r, _SAVED))])
-    return Section(f"Acting by {act}", tables=tables, verdict=_verdict(act, rows[0]))
+    seeds = cells[0]["intervention"]["acted"]["n"]
+    return Section(f"Acting by {act}", tables=tables, verdict=_verdict(act, rows[0], seeds))
 
 
-def _verdict(act: str, best: InterventionRecord) -> str:
+def _verdict(act: str, best: InterventionRecord, seeds: int) -> str:
     """Return what the alarm of the best row is worth, for those who see these tables first."""
     saved = best["intervention"][_SAVED]
     if saved["value"] is None:
-        return f"{act} cannot mend these faults: it saves less than 5 % of the nominal return."
+        return (
+            f"{act} cannot mend these faults: at once and on the true parts it saves less than 5 % "
+            "of the nominal return."
+        )
     doubt = "" if saved["low"] > max(0.0, _value(best, _PLACEBO)) else "not shown to be "
+    if seeds < _FEWEST:
+        doubt = f"not shown by {counted(seeds, 'seed(s)')} to be "
     return (
         f"The alarm of {row_of(best)} is {doubt}worth having: {act} at the alarm saves "
         f"{_ends(saved)} % of the return that {act} at once, on the true parts, would save; "
@@ -103,9 +111,11 @@ def _useless(act: str, cells: Records) -> list[Table]:
     rows, text = list(dict.fromkeys(map(row_of, cells))), COLUMNS[_HARM].text
     lines: dict[tuple[str, ...], dict[str, str]] = {}
     for r in cells:
-        twin, never, watchdog = (r["returns"][arm] for arm in ("twin", "never", "watchdog"))
-        fault = r["environment"], r["anomaly"], text((twin - never) / abs(twin))
-        lines.setdefault(fault, {})[row_of(r)] = text((never - watchdog) / abs(twin))
+        arms = [r["returns"][arm] for arm in ("twin", "never", "watchdog")]
+        twin, never, watchdog = np.array(arms, float)  # NaN where there is none
+        nominal = abs(twin) or math.nan
+        fault = r["environment"], r["anomaly"], text(float(twin - never) / nominal)
+        lines.setdefault(fault, {})[row_of(r)] = text(float(never - watchdog) / nominal)
     title = f"Faults that {act} cannot mend: their cost, and that of acting (% of nominal return)"
     texts = [[*labels, *(line.get(row, "") for row in rows)] for labels, line in lines.items()]
     header = ["environment", "anomaly", "fault", *rows]

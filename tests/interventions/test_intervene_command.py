@@ -6,7 +6,7 @@ from oodd_interventions import study
 
 from oodd_eval.cli.main import main
 
-CELLS = [study_cell([episode(s, [100, 20, 80, 100, 30, 90, 95 + s]) for s in range(3)])]
+CELLS = [study_cell([episode(s, [100, 20, 80, 100, 30, 90, 95 + s]) for s in range(5)])]
 COMMAND = ["intervene", "--detector", "panel", "--env", "hopper"]
 
 

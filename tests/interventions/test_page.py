@@ -1,5 +1,6 @@
 """Tables, Markdown and pages of studies of interventions."""
 
+import math
 import re
 from xml.etree import ElementTree as ET
 
@@ -48,6 +49,23 @@ def test_an_alarm_that_saves_no_more_than_the_placebo_is_not_called_worth_having
     episodes = [episode(s, [100, 20, watchdog, 100, 30, 100, 100]) for s in range(6)]
     first, *_ = sections(records_of([study_cell(episodes)]))
     assert "is not shown to be worth having" in first.verdict
+
+
+def test_few_seeds_show_nothing():
+    for seeds, doubt in ((1, "not shown by 1 seed to be"), (4, "not shown by 4"), (5, "is worth")):
+        episodes = [episode(s, SAVES) for s in range(seeds)]
+        first, *_ = sections(records_of([study_cell(episodes)]))
+        assert doubt in first.verdict
+
+
+@pytest.mark.parametrize("twin", [0.0, math.nan])
+def test_shares_of_no_nominal_return_are_not_known(twin, tmp_path):
+    """Rewards may be rare, so that nominal episodes have none."""
+    episodes = [episode(s, [twin, -20, -10, 0, -20, 0, 0]) for s in range(2)]
+    made = [study_cell(episodes)]
+    parts = sections(records_of(made))
+    assert table(parts, "Faults that mask cannot mend")[0]["fault"] == "\N{EN DASH}"
+    write_pages(tmp_path, made)
 
 
 def test_faults_that_nothing_can_mend_are_said_to_be_such():
