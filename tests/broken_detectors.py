@@ -77,7 +77,7 @@ class Good:
         return float(self.score(self.lived())[-1])
 
     def lived(self):
-        return Trajectory(self.seen, np.array(self.done) if self.done else np.empty((0, 1)))
+        return Trajectory(self.seen, self.done or None)
 
     def explain_last(self):
         shares, onsets, *naming = self.explain(self.lived())

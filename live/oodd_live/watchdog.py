@@ -34,7 +34,7 @@ from oodd_eval.metrics.cusum import Standardization
 from oodd_eval.metrics.faults import ParetoTail, StreamScale, readings
 from oodd_eval.names import check_known, counted
 from oodd_eval.plugins.contract import AnyDetector, StorableDetector, copied
-from oodd_eval.plugins.explanations import Explanation, naming_of
+from oodd_eval.plugins.explanations import Explanation, checked_naming, naming_of
 from oodd_eval.plugins.state import pack, read_state, take, write_state
 from oodd_eval.plugins.voices import VoiceCosts, costs_of_voices
 from oodd_live.handle import DetectorHandle, has_actions, streaming
@@ -507,8 +507,9 @@ class Watchdog:
         shares, onset, *naming = self._explain_last()
         if onset < 0:
             return {}, None, {}, ""
-        explanation = Explanation(shares[None], np.array([onset]), *naming)
-        named = naming_of(explanation, len(self._parts) - len(self.sensors))
+        widths = len(self.sensors), len(self._parts) - len(self.sensors)
+        checked = [checked_naming(n, *widths) for n in naming if n is not None]
+        named = naming_of(Explanation(shares[None], np.array([onset]), *checked), widths[1])
         order = np.argsort(-shares, kind="stable").tolist()
         sensors = {self.sensors[d]: float(shares[d]) for d in order}
         values = np.concatenate([named.sensors, named.actuators]).tolist()

@@ -388,6 +388,22 @@ def test_a_reading_names_sensors_and_actuators_and_the_kind():
     ]  # fmt: skip
 
 
+class NamesBarely(NamesParts):
+    """Its naming is a tuple."""
+
+    said = tuple(NamesParts.said)
+
+
+def test_a_naming_may_be_a_tuple_and_is_checked(monkeypatch):
+    watchdog = Watchdog.fit(NamesBarely(), TRAIN, CALIBRATION, statistic="score", sensors=NAMES)
+    monkeypatch.setattr(NamesBarely, "said", (*NamesBarely.said[:1], np.zeros(0), np.ones(3), ""))
+    reading = watchdog.update([0.0, 60.0, 20.0])
+    assert reading.parts == {"y": 0.9, "x": 0.2}
+    monkeypatch.setattr(NamesBarely, "said", (np.zeros(2), np.zeros(0), np.ones(3), ""))
+    with pytest.raises(ContractError, match=r"shape \(2,\), expected float64 of shape \(3,\)"):
+        watchdog.update([0.0, 60.0, 20.0])
+
+
 def test_actuators_have_the_names_of_a_split_also_after_loading(tmp_path):
     with load_split("mini").opened() as opened:
         data = opened("cartpole")

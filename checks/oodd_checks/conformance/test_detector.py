@@ -49,6 +49,7 @@ from oodd_eval.plugins.explanations import (
     Explanation,
     Naming,
     checked_explanation,
+    checked_naming,
     explains,
     naming_of,
 )
@@ -408,8 +409,10 @@ def _streamed_explanations(trial: Trial, trajectory: Trajectory) -> list[Explana
         detector.reset()
         for row in zip(trajectory.observations, [None, *trajectory.actions], strict=True):
             detector.update(*row)
-            shares, onset, *naming = detector.explain_last()
-            latest.append(Explanation(shares[None], np.array([int(onset)]), *naming))
+            shares, onset, *named = detector.explain_last()
+            widths = trajectory.observation_dim, trajectory.action_dim
+            named = [checked_naming(naming, *widths) for naming in named if naming is not None]
+            latest.append(Explanation(shares[None], np.array([int(onset)]), *named))
     return latest
 
 
