@@ -15,13 +15,12 @@ from oodd_recording.closed_loop import RecordedEpisode, Setup, record_again, ret
 from oodd_recording.policies import CustomPolicy
 from oodd_recording.registered import info_of
 
-from oodd_eval.data.facts import Group
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import ContractError
 from oodd_eval.metrics.alarms import GuaranteedAlarm
 from oodd_eval.plugins.explanations import Naming, checked_explanation, explains, naming_of
 from oodd_interventions.acts import failed
-from oodd_interventions.situation import ActSpec, Situation
+from oodd_interventions.situation import Act, ActSpec, Situation
 
 Row = NDArray[np.float32]
 
@@ -58,7 +57,7 @@ class LoopPair:
 
     kind: str
     strength: float | None
-    group: Group
+    group: str
     twin: RecordedEpisode
     never: RecordedEpisode
 
@@ -133,8 +132,7 @@ class Loop:
 
     def oracle(self, pair: LoopPair, spec: ActSpec) -> LoopArm:
         """Return the arm that acts at the effect on the true parts."""
-        truth = {0: pair.truth()}
-        return self.arm(pair, spec, pair.never.effect, lambda _, since: truth.get(since))
+        return self.arm(pair, spec, pair.never.effect, _replayed({0: pair.truth()}))
 
     def failed(self, episode: RecordedEpisode) -> bool:
         """Tell whether an episode counts as a failure."""
@@ -157,7 +155,8 @@ class _TakingOver:
             policy.reset()
         self._rows = np.empty((cap + 1, self._info.observation_dim), np.float32)
         self._actions = np.empty((cap, self._info.action_dim), np.float32)
-        self._t, self._acting = 0, policy
+        self._t = 0
+        self._acting: Act = policy
         self.namings: dict[int, NamedParts] = {}
 
     def act(self, row: Row) -> Any:
@@ -186,11 +185,11 @@ class _TakingOver:
         width, values = self._info.action_dim, np.ravel(action)
         if self._info.discrete:
             expected = f"a whole number from 0 to {width - 1}"
-            fine = np.ndim(action) == 0 and np.isin(action, range(width)).all()
+            fine = np.ndim(action) == 0 and bool(np.isin(action, range(width)).all())
         else:
             expected = f"{width} finite number(s)"
             fine = values.shape == (width,) and values.dtype.kind in "fiu"
-            fine = fine and np.isfinite(values).all()
+            fine = fine and bool(np.isfinite(values).all())
         if not fine:
             act, environment = self._spec.name, self._loop.setup.environment
             raise ContractError(
@@ -227,9 +226,7 @@ def run_cell(
     watchdogs = [
         loop.arm(pair, spec, row, detector.name) for pair, row in zip(pairs, alarms, strict=True)
     ]
-    replays: list[Namer] = [
-        lambda _, since, namings=arm.namings: namings.get(since) for arm in watchdogs
-    ]
+    replays = [_replayed(arm.namings) for arm in watchdogs]
     arms_of, episodes = [], []
     for i, pair in enumerate(pairs):
         following = [*range(i + 1, len(pairs)), *range(i)]
@@ -264,6 +261,11 @@ def run_cell(
         for name in (arms_of[0] if arms_of else ())
     }
     return {"episodes": episodes, "curves": {"first": FIRST, "arms": curves}}
+
+
+def _replayed(namings: Mapping[int, NamedParts]) -> Namer:
+    """Return what names parts as they were named once."""
+    return lambda _, since: namings.get(since)
 
 
 def _naming(model: ReadingModel, pair: LoopPair, watchdog: LoopArm) -> dict[str, Any]:

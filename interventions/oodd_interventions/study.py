@@ -284,9 +284,9 @@ def _run(cells: Sequence[StudyCell], jobs: int | None, observer: Progress) -> di
         try:
             units = {_name_of(cell.unit): (cell.study, cell.unit) for cell in missing}
             fits = {pool.submit(fit, *units[name]): name for name in units}
-            for future in as_completed(fits):
-                failure = _failure(future, fits[future])
-                observer(done, len(cells), f"{fits[future]} {'failed' if failure else 'fitted'}")
+            for fitting in as_completed(fits):
+                failure = _failure(fitting, fits[fitting])
+                observer(done, len(cells), f"{fits[fitting]} {'failed' if failure else 'fitted'}")
                 reasons |= failure
             batches: dict[str, list[StudyCell]] = {}
             for cell in missing:
