@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -251,3 +252,135 @@ def test_curves_begin_before_the_effect_and_sum_up_to_the_returns(loop, pairs):
     rewards = [p.never.rewards[p.never.effect + cell["curves"]["first"] :] for p in chosen]
     assert len(curve) == max(map(len, rewards))
     assert sum(curve) == pytest.approx(sum(map(np.sum, rewards)) / SEEDS)
+
+
+def test_each_arm_acts_at_its_row_on_its_own_namings(loop, pairs):
+    """The act leaves all to the policy, and writes down what it knows at each row."""
+    chosen = pairs["shutdown"][:3]
+    at = {0: 40, 2: 50}
+    rows = {chosen[i].never.trajectory.observations.tobytes(): t for i, t in at.items()}
+    rows[chosen[0].twin.trajectory.observations.tobytes()] = 60
+    numbers = {p.twin.trajectory.observations[0].tobytes(): i for i, p in enumerate(chosen)}
+    heard = []
+
+    class Judging(Judge):
+        def _explain(self, x):
+            sensor = (len(x) + numbers[x.observations[0].tobytes()]) % 4
+            shares = np.full(x.observations.shape, 0.25)
+            onsets = np.maximum(np.arange(len(x)) - 3, 0)
+            return Explanation(shares, onsets, naming_of_sensor(sensor))
+
+    class Writing:
+        def __init__(self, situation):
+            self.situation, self.lines = situation, []
+            heard.append(self.lines)
+
+        def act(self, row):
+            now = self.situation
+            assert np.array_equal(now.rows[-1], row)
+            [sensor] = np.flatnonzero(now.naming.sensors)
+            self.lines.append((len(now.rows) - 1, int(sensor), now.onset))
+            return now.policy.act(row)
+
+    def expected(episode, begin, from_episode, first):
+        """Lines of an arm that acts from a row on, with the namings of a watchdog's rows."""
+        lines = []
+        for t in range(begin, episode.trajectory.transitions):
+            since = max(k for k in (0, *RENAMED) if k <= t - begin)
+            sensor = (first + since + 1 + from_episode) % 4
+            lines.append((t, sensor, first + since - 3))
+        return lines
+
+    def scores(x):
+        return np.arange(len(x)) >= rows.get(x.observations.tobytes(), 10**6)
+
+    judge = FittedDetector(
+        DetectorHandle(Judging(scores, True), "score", True, False, {}), GuaranteedAlarm(None, 0.5)
+    )
+    writing = ActSpec("writing", Writing, "the policy goes on", ("sensor",))
+    oracles = [loop.oracle(pair, writing) for pair in chosen]
+    assert [lines[0][0] for lines in heard] == [pair.never.effect for pair in chosen]
+    assert [lines[0][2] for lines in heard] == [pair.never.onset for pair in chosen]
+    assert [lines[0][1] for lines in heard] == [p.never.parameters["sensors"][0] for p in chosen]
+    heard.clear()
+    cell = run_cell(loop, chosen, oracles, writing, judge)
+    never, twin = [p.never for p in chosen], [p.twin for p in chosen]
+    assert heard == [
+        expected(never[0], 40, 0, 40),  # watchdogs
+        expected(never[2], 50, 2, 50),
+        expected(never[0], 50, 2, 50),  # placebo, false and forced, then of the next episodes
+        expected(twin[0], 60, 0, 60),
+        expected(twin[0], 40, 0, 40),
+        expected(never[1], 50, 2, 50),
+        expected(never[2], 40, 0, 40),
+        expected(twin[2], 50, 2, 50),
+    ]
+    acted = [e["acted"] for e in cell["episodes"]]
+    assert [a["watchdog"] for a in acted] == [40, None, 50]
+    assert [a["placebo"] for a in acted] == [50, 50, 40]
+    assert [a["false"] for a in acted] == [60, None, None]
+    assert [a["forced"] for a in acted] == [40, None, 50]
+    assert [a["oracle"] for a in acted] == [pair.never.effect for pair in chosen]
+
+
+def test_returns_are_those_of_their_arms(loop, pairs):
+    """Of the two commands each arm has one from its row on, so that all returns differ."""
+    pair, other = pairs["iid"][:2]
+    effect = pair.never.effect
+    episodes = (pair.never, other.never, pair.twin)
+    first = (effect + 9, effect + 4, effect + 14)
+    rows = {e.trajectory.observations.tobytes(): t for e, t in zip(episodes, first, strict=True)}
+
+    def scores(x):
+        return np.arange(len(x)) >= rows.get(x.observations.tobytes(), 10**6)
+
+    spec, judge = constant(0), detector_of(scores, naming_of_sensor(1))
+    episode, _ = cell_of(loop, [pair, other], spec, judge)["episodes"]
+    arms = {
+        "twin": (None, True), "never": (None, False), "watchdog": (effect + 9, False),
+        "oracle": (effect, False), "placebo": (effect + 4, False), "false": (effect + 14, True),
+        "forced": (effect + 9, True),
+    }  # fmt: skip
+    for arm, (row, nominal) in arms.items():
+        alone = loop.arm(pair, spec, row, judge.name, nominal=nominal).episode
+        assert episode["returns"][arm] == return_of(alone), arm
+        assert episode["rows"][arm] == len(alone.rewards)
+        assert episode["failed"][arm] == loop.failed(alone)
+    assert len({episode["returns"][arm] for arm in ("watchdog", "placebo", "oracle")}) == 3
+
+
+def test_detectors_judge_and_name_what_they_may_see(pairs):
+    widths = []
+
+    class Watching(Judge):
+        def score(self, x):
+            widths.append(x.action_dim)
+            return super().score(x)
+
+        def _explain(self, x):
+            widths.append(x.action_dim)
+            return super()._explain(x)
+
+    for actions, width in ((True, 2), (False, 0)):
+        naming = naming_of_sensor(1)._replace(actuators=np.zeros(width))
+        handle = DetectorHandle(Watching(zeros, naming), "score", actions, False, {})
+        fitted = FittedDetector(handle, GuaranteedAlarm(None, 0.5))
+        fitted.alarm(pairs["iid"][0].never)
+        fitted.name(pairs["iid"][0].never.trajectory)
+        assert widths == [width] * 2
+        widths.clear()
+
+
+def test_an_actuator_at_fault_is_true(pairs):
+    pair = pairs["wind-l2r"][0]
+    parameters = {"actuator": 1, "share": 0.5}
+    naming, _ = replace(pair, never=replace(pair.never, parameters=parameters)).truth()
+    assert (naming.sensors.sum(), naming.actuators.tolist(), naming.kind) == (0, [0, 1], "actuator")
+
+
+def test_the_largest_readings_are_in_standard_deviations(loop, pairs):
+    pair, judge = pairs["iid"][0], detector_of(from_row(40), naming_of_sensor(3))
+    [episode] = cell_of(loop, [pair], MASK, judge)["episodes"]
+    scale = loop.model.sensors
+    distances = np.abs((pair.never.trajectory.observations[40] - scale.mean) / scale.std)
+    assert episode["largest"]["0"] == sorted(range(4), key=lambda d: -distances[d])
