@@ -1,15 +1,18 @@
 """Studies: the same files for any number of processes and after an interrupt, failures reported."""
 
 import json
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from helpers_plugins import install
-from oodd_interventions import ActSpec
+from oodd_interventions import ActSpec, study
 from oodd_interventions.study import intervene, suiting
 from oodd_recording.build import build_split
 
+from oodd_eval import Trajectory
 from oodd_eval.data.facts import SplitDefinition
-from oodd_eval.errors import UnknownNameError, UsageError
+from oodd_eval.errors import SimulationError, UnknownNameError, UsageError
 
 KINDS = "iid,shutdown,wind-l2r"
 STUDY = {"kinds": KINDS, "seeds": 3, "jobs": 1, "acts": "mask"}
@@ -98,9 +101,41 @@ def test_a_threshold_is_not_taken_from_a_study_with_other_scores(split, tmp_path
     alarms = []
     for directory, weight in (("a", 0.03), ("a", 1.0), ("b", 1.0)):
         output, values = tmp_path / directory, forest | {"weight": weight}
-        study = intervene("rf-ewma", "cartpole", output=output, parameters=values, **settings)
-        alarms.append([(e["alarm"], e["false_alarm"]) for e in study.cells[0]["episodes"]])
+        made = intervene("rf-ewma", "cartpole", output=output, parameters=values, **settings)
+        alarms.append([(e["alarm"], e["false_alarm"]) for e in made.cells[0]["episodes"]])
     assert alarms[0] != alarms[1] == alarms[2]
+
+
+@pytest.mark.slow
+def test_seeds_and_level_are_those_asked_for_and_fresh_fits_again(split, tmp_path):
+    settings = STUDY | {"kinds": "iid", "split": split, "output": tmp_path, "base": 7}
+    alarms = []
+    for level in (0.05, 0.6):
+        [cell] = intervene("mahalanobis", "cartpole", level=level, **settings).cells
+        assert [e["seed"] for e in cell["episodes"]] == [7_000_000 + k for k in range(3)]
+        alarms.append([e["alarm"] for e in cell["episodes"]])
+    rows = [[120 if row is None else row for row in of] for of in alarms]
+    assert all(often <= rare for rare, often in zip(*rows, strict=True))
+    assert rows[0] != rows[1]
+    files = [f for f in tmp_path.rglob("*") if f.suffix == ".json" or "-60." in f.name]
+    before = {f: f.stat().st_mtime_ns for f in files}
+    assert len(before) == 2
+    intervene("mahalanobis", "cartpole", level=0.6, fresh=True, **settings)
+    assert all(f.stat().st_mtime_ns > time for f, time in before.items())
+
+
+def test_short_twins_give_way_to_the_next_seed(monkeypatch, tmp_path):
+    def record(seed):
+        rows = np.zeros((40 if seed % 2 else 60, 4), np.float32)
+        return SimpleNamespace(seed=seed, trajectory=Trajectory(rows))
+
+    loop = SimpleNamespace(setup=SimpleNamespace(record=record))
+    monkeypatch.setattr(study, "_loop", lambda *_: loop)
+    twins = study._twins(study.Study(tmp_path, tmp_path, 3, 7, 0.05), "cartpole")
+    assert [twin.seed for twin in twins] == [7_000_000, 7_000_002, 7_000_004]
+    monkeypatch.setattr(study, "SHORTEST_TWIN", 61)
+    with pytest.raises(SimulationError, match="only 0 have nominal episodes of 61 transitions"):
+        study._twins(study.Study(tmp_path, tmp_path, 2, 7, 0.05), "cartpole")
 
 
 PLUGIN = """
@@ -134,15 +169,15 @@ def test_what_fails_is_reported_and_the_others_go_on(split, tmp_path, monkeypatc
     install(monkeypatch, tmp_path / "plugin", "acting", PLUGIN)
     settings = STUDY | {"acts": "mask,still", "kinds": "iid,wind-l2r"}
     output = tmp_path / "study"
-    study = intervene("failing,good,missing", "cartpole", split=split, output=output, **settings)
-    assert [(c["detector"], c["anomaly"], c["act"]) for c in study.cells] == [
+    made = intervene("failing,good,missing", "cartpole", split=split, output=output, **settings)
+    assert [(c["detector"], c["anomaly"], c["act"]) for c in made.cells] == [
         ("good", "iid", "mask"),
         ("good", "wind-l2r", "still"),
     ]
-    assert study.reasons["cartpole/failing"] == "ValueError: no fit today"
-    assert "no_such_module" in study.reasons["cartpole/missing"]
+    assert made.reasons["cartpole/failing"] == "ValueError: no fit today"
+    assert "no_such_module" in made.reasons["cartpole/missing"]
     # It does not explain, so that it names nothing and its mask changes nothing.
-    masked, still = (cell["episodes"] for cell in study.cells)
+    masked, still = (cell["episodes"] for cell in made.cells)
     assert all(e["returns"]["watchdog"] == e["returns"]["never"] for e in masked)
     assert all(e["named"].get("0", {}).get("kind", "") == "" for e in masked)
     assert any(e["acted"]["watchdog"] is not None for e in still)
@@ -168,8 +203,9 @@ def test_acts_of_a_broken_plugin_are_not_passed_over_in_silence(split, tmp_path,
     settings = {"split": split, "output": tmp_path / "study", "seeds": 1, "jobs": 1}
     with pytest.raises(UsageError, match=r"unknown act 'brake'.*plug-in 'braking'.*'brake'"):
         intervene("mahalanobis", "cartpole", acts="brake", **settings)
-    study = intervene("mahalanobis", "cartpole", acts="mask", kinds="wind-l2r", **settings)
-    [plugin] = study.reasons
+    [plugin] = intervene(
+        "mahalanobis", "cartpole", acts="mask", kinds="wind-l2r", **settings
+    ).reasons
     assert plugin.startswith("plug-in 'braking'")
 
 
