@@ -25,10 +25,8 @@ FLIPPED: Final = 0.05
 _ROUNDING: Final = 1e-5  # of a sum of shares
 
 
-FAULT_KINDS: Final = ("sensor", "actuator", "body", "environment")
+KINDS: Final = ("", "sensor", "actuator", "body", "environment")
 """What a naming may say of where a fault is; an empty text where it says nothing."""
-
-KINDS: Final = ("", *FAULT_KINDS)
 
 
 class Naming(NamedTuple):
@@ -46,7 +44,7 @@ class Naming(NamedTuple):
         Size of each sensor's fault in the sensor's unit, a standard deviation about what it should
         read. NaN where it is not known, and infinite where the sensor's reading says nothing.
     kind
-        One of `FAULT_KINDS`, or empty.
+        One of `KINDS`.
     """
 
     sensors: NDArray[np.float64]
@@ -223,15 +221,14 @@ def naming_of(explanation: Explanation, actions: int) -> Naming:
     >>> naming_of(Explanation(shares, np.array([0])), actions=1).sensors
     array([0., 1., 0., 1.])
     """
-    none = np.zeros(actions)
     if naming := explanation.naming:
-        return naming if len(naming.actuators) else naming._replace(actuators=none)
+        return naming if len(naming.actuators) else naming._replace(actuators=np.zeros(actions))
     shares = np.nan_to_num(explanation.shares[-1])
     order = np.argsort(-shares, kind="stable")
     before = np.cumsum(shares[order]) - shares[order]
     sensors = np.zeros(len(shares))
     sensors[order[(before < 0.5 - _ROUNDING) & (shares[order] > 0)]] = 1.0
-    return Naming(sensors, none, np.full(len(shares), np.nan))
+    return Naming(sensors, np.zeros(actions), np.full(len(shares), np.nan))
 
 
 def _check_form(name: str, array: Any, form: str) -> None:

@@ -41,13 +41,8 @@ MOST_ENDS: Final = 3  # after so many checks that ended their process, the rest 
 # Nothing of the user's pytest, and nothing that prints or changes the process.
 _OPTIONS: Final = (
     *("-c", os.devnull, "--noconftest", "--assert=plain", "--import-mode=importlib"),
-    "-pno:cacheprovider",
-    "-pno:capture",
-    "-pno:faulthandler",
-    "-pno:logging",
-    "-pno:terminal",
-    "-pno:threadexception",
-    "-pno:unraisableexception",
+    *("-pno:cacheprovider", "-pno:capture", "-pno:faulthandler", "-pno:logging", "-pno:terminal"),
+    *("-pno:threadexception", "-pno:unraisableexception"),
 )
 _VARIABLES: Final = {
     "PYTEST_ADDOPTS": "",
