@@ -99,9 +99,7 @@ WORST: Final = "worst environment"
 
 _ALARMS_OF_LOGS: Final = (
     *("events_found", "delay_censored", f"found_within_{catalogue.FOUND_WITHIN[-1]}", "missed"),
-    "false_episodes",
-    "early",
-    "false_alarms_per_hour",
+    *("false_episodes", "early", "false_alarms_per_hour"),
 )
 
 ROWS: Final = tuple(name for name, info in catalogue.METRICS.items() if info.request)
