@@ -308,7 +308,11 @@ def _failure(future: Future[Any], name: str) -> dict[str, str]:
     """Return why something in a process failed, by its name; nothing where it did not."""
     error = future.exception()
     if isinstance(error, BrokenProcessPool):
-        raise error
+        raise SimulationError(
+            "a process of the study ended all at once, for want of memory or by a detector's or an "
+            "act's native code: the same command goes on; take fewer jobs, or leave out the last "
+            "detector without cells"
+        ) from error
     return {name: describe(error)} if error else {}
 
 
@@ -407,7 +411,9 @@ def run_cells(cells: Sequence[StudyCell]) -> dict[str, str]:
                 oracles[act.name] = [loop.oracle(pair, act) for pair in pairs]
             start = time.perf_counter()
             outcome = run_cell(loop, pairs, oracles[act.name], act, _detectors[file])
-        except Exception as error:  # noqa: BLE001  of foreign code
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # noqa: BLE001  foreign code may raise anything
             failed = f"{name}/{record.condition}--{act.name}" if file in _detectors else name
             reasons[failed] = describe(error)
             continue

@@ -145,6 +145,14 @@ class Failing(Good):
     def fit(self, nominal):
         raise ValueError("no fit today")
 
+class Leaving(Good):
+    def fit(self, nominal):
+        raise SystemExit(4)
+
+class Dying(Good):
+    def fit(self, nominal):
+        os._exit(3)
+
 class Still:
     def __init__(self, situation):
         self.row = len(situation.rows) - 1
@@ -156,7 +164,7 @@ class Still:
 @hookimpl
 def oodd_detectors():
     missing = DetectorSpec("missing", Good, "a test's", requires=("no_such_module",))
-    return [*offer(failing=Failing, good=Good), missing]
+    return [*offer(failing=Failing, leaving=Leaving, dying=Dying, good=Good), missing]
 
 @hookimpl
 def oodd_acts():
@@ -169,18 +177,23 @@ def test_what_fails_is_reported_and_the_others_go_on(split, tmp_path, monkeypatc
     install(monkeypatch, tmp_path / "plugin", "acting", PLUGIN)
     settings = STUDY | {"acts": "mask,still", "kinds": "iid,wind-l2r"}
     output = tmp_path / "study"
-    made = intervene("failing,good,missing", "cartpole", split=split, output=output, **settings)
+    made = intervene(
+        "failing,leaving,good,missing", "cartpole", split=split, output=output, **settings
+    )
     assert [(c["detector"], c["anomaly"], c["act"]) for c in made.cells] == [
         ("good", "iid", "mask"),
         ("good", "wind-l2r", "still"),
     ]
     assert made.reasons["cartpole/failing"] == "ValueError: no fit today"
+    assert made.reasons["cartpole/leaving"] == "SystemExit: 4"
     assert "no_such_module" in made.reasons["cartpole/missing"]
     # It does not explain, so that it names nothing and its mask changes nothing.
     masked, still = (cell["episodes"] for cell in made.cells)
     assert all(e["returns"]["watchdog"] == e["returns"]["never"] for e in masked)
     assert all(e["named"].get("0", {}).get("kind", "") == "" for e in masked)
     assert any(e["acted"]["watchdog"] is not None for e in still)
+    with pytest.raises(SimulationError, match="a process of the study ended all at once"):
+        intervene("dying", "cartpole", split=split, output=output, **settings)
 
 
 def test_wrong_names_and_the_base_of_the_split_are_refused(split, tmp_path):
