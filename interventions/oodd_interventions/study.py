@@ -46,7 +46,7 @@ from oodd_eval.plugins.discovery import Plugins, describe, discover
 from oodd_eval.plugins.state import pack, read_state, write_state
 from oodd_eval.prose import terminal_text
 from oodd_eval.results.record import Record, gather
-from oodd_eval.scoring.plan import Unit, make_plan
+from oodd_eval.scoring.plan import Unit, make_plan, source_digest
 from oodd_interventions.acts import ACTS
 from oodd_interventions.columns import InterventionRecord, records_of
 from oodd_interventions.loop import FittedDetector, Loop, LoopArm, LoopPair, run_cell
@@ -73,6 +73,8 @@ IDENTITY: Final = (
 """Fields of a record that say what a cell is of."""
 BASE: Final = 680
 """Seeds of a study are this number in millions, and those after it: no split's, by default."""
+
+_SHIPPED: Final = ("oodd_interventions.", "oodd_worlds.")
 
 Names = str | Sequence[str]
 
@@ -145,6 +147,8 @@ class StudyCell:
         identity = {name: getattr(self.record, name) for name in IDENTITY}
         identity |= {"schema": SCHEMA, "anomaly": str(self.record.condition), "cap": cap}
         identity |= {"act": self.act.name, "level": study.level, "base": study.base}
+        if source := source_of(self.act):
+            identity["act_source"] = source
         plain: dict[str, Any] = json.loads(json.dumps(identity))
         return plain
 
@@ -264,6 +268,15 @@ def _selected(names: str, offered: Sequence[ActSpec], broken: Mapping[str, str])
             plugins = "; ".join(f"{plugin}: {reason}" for plugin, reason in broken.items())
             raise UsageError(f"{error}; broken is {plugins}") from error
         raise
+
+
+def source_of(act: ActSpec) -> str:
+    """Return the digest of a foreign act's code, so that a change of it is run; else nothing."""
+    make = act.make
+    while isinstance(make, functools.partial):
+        make = make.func
+    module = getattr(make, "__module__", "oodd_interventions.")
+    return "" if module.startswith(_SHIPPED) else source_digest(module)
 
 
 def suiting(

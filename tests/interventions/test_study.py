@@ -1,5 +1,7 @@
 """Studies: the same files for any number of processes and after an interrupt, failures reported."""
 
+import functools
+import importlib
 import json
 from types import SimpleNamespace
 
@@ -7,12 +9,15 @@ import numpy as np
 import pytest
 from helpers_plugins import install
 from oodd_interventions import ActSpec, study
+from oodd_interventions.acts import ACTS
 from oodd_interventions.study import intervene, suiting
 from oodd_recording.build import build_split
+from oodd_worlds.acts import ACTS as WORLDS
 
 from oodd_eval import Trajectory
 from oodd_eval.data.facts import SplitDefinition
 from oodd_eval.errors import SimulationError, UnknownNameError, UsageError
+from oodd_eval.scoring.plan import source_digest
 
 KINDS = "iid,shutdown,wind-l2r"
 STUDY = {"kinds": KINDS, "seeds": 3, "jobs": 1, "acts": "mask"}
@@ -202,6 +207,19 @@ def test_wrong_names_and_the_base_of_the_split_are_refused(split, tmp_path):
     with pytest.raises(UnknownNameError, match="act"):
         intervene("mewma-a", "cartpole", split=split, acts="mosk", output=tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+def test_the_code_of_a_foreign_act_is_part_of_what_a_cell_is_of(tmp_path, monkeypatch):
+    digests = set()
+    for code in ("def make(situation): ...", "def make(situation): return None"):
+        install(monkeypatch, tmp_path, "editing", code)
+        make = importlib.import_module("oodd_editing").make
+        source_digest.cache_clear()
+        for function in (make, functools.partial(make)):
+            digests.add(study.source_of(ActSpec("edited", function, "", ("dynamics",))))
+    assert len(digests) == 2
+    assert "" not in digests
+    assert {study.source_of(act) for act in (*ACTS, *WORLDS)} == {""}
 
 
 BROKEN = """
