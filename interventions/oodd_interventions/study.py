@@ -40,7 +40,7 @@ from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import SimulationError, UnknownNameError, UsageError
 from oodd_eval.metrics.alarms import Calibration, GuaranteedAlarm
 from oodd_eval.metrics.cusum import Standardization
-from oodd_eval.names import select
+from oodd_eval.names import read, select, whole_number
 from oodd_eval.plugins.contract import StorableDetector
 from oodd_eval.plugins.discovery import Plugins, describe, discover
 from oodd_eval.plugins.state import pack, read_state, write_state
@@ -179,7 +179,8 @@ def intervene(
 ) -> Interventions:
     """Run the closed loop with acts at alarms: what detectors' alarms save.
 
-    Cells that are in `output` already are taken from there.
+    Cells that are in `output` already are taken from there. Processes import the script that calls
+    it, so that the call stands under ``if __name__ == "__main__":``.
 
     Parameters
     ----------
@@ -214,8 +215,12 @@ def intervene(
     Raises
     ------
     UsageError
-        For unknown names, and a split that was not recorded.
+        For unknown names, other numbers, and a split that was not recorded.
     """
+    seeds = read("seeds", functools.partial(whole_number, least=1), seeds)
+    base = read("base", functools.partial(whole_number, least=0), base)
+    if not 0 < level < 1:
+        raise UsageError(f"level is {level!r}, expected a share of episodes between 0 and 1")
     opened, plugins = load_split(split), discover()
     register([spec for spec, _ in plugins.custom_specs.values()])
     environment_names, kind_names = opened.select(_listed(environments), _listed(kinds or "all"))
@@ -324,7 +329,7 @@ def _failure(future: Future[Any], name: str) -> dict[str, str]:
         raise SimulationError(
             "a process of the study ended all at once, for want of memory or by a detector's or an "
             "act's native code: the same command goes on; take fewer jobs, or leave out the last "
-            "detector without cells"
+            "detector without cells; in a script call intervene under if __name__ == '__main__'"
         ) from error
     return {name: describe(error)} if error else {}
 

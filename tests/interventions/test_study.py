@@ -10,11 +10,11 @@ import pytest
 from helpers_plugins import install
 from oodd_interventions import ActSpec, study
 from oodd_interventions.acts import ACTS
-from oodd_interventions.study import intervene, suiting
+from oodd_interventions.study import suiting
 from oodd_recording.build import build_split
 from oodd_worlds.acts import ACTS as WORLDS
 
-from oodd_eval import Trajectory
+from oodd_eval import Trajectory, intervene
 from oodd_eval.data.facts import SplitDefinition
 from oodd_eval.errors import SimulationError, UnknownNameError, UsageError
 from oodd_eval.scoring.plan import source_digest
@@ -238,6 +238,15 @@ def test_acts_of_a_broken_plugin_are_not_passed_over_in_silence(split, tmp_path,
         "mahalanobis", "cartpole", acts="mask", kinds="wind-l2r", **settings
     ).reasons
     assert plugin.startswith("plug-in 'braking'")
+
+
+@pytest.mark.parametrize(
+    "setting", [{"seeds": 0}, {"seeds": 1.5}, {"base": -1}, {"level": 5}, {"level": 0}], ids=str
+)
+def test_numbers_that_make_no_study_are_refused(setting, split, tmp_path):
+    [name] = setting
+    with pytest.raises(UsageError, match=f"^{name} is"):
+        intervene("mahalanobis", "cartpole", split=split, output=tmp_path, **setting)
 
 
 def test_an_act_of_the_environment_takes_the_place_of_a_general_one():
