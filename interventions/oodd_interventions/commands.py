@@ -75,7 +75,8 @@ def intervene(options: Options) -> int:
     for name, reason in done.reasons.items():
         print_prose(f"FAILED {name}: {reason}", console, "red")
     if not done.cells:
-        return 1 if done.reasons else say("no act suits these kinds of anomalies", 5)
+        advice = "mask is for faults of sensors, stop and switch for others in some environments"
+        return 1 if done.reasons else say(f"no act suits these kinds of anomalies: {advice}", 5)
     write_pages(done.output, done.cells)
     parts = sections(done.records)
     if options.verbosity >= 0:
