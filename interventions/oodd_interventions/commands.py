@@ -84,5 +84,5 @@ def intervene(options: Options) -> int:
     else:
         print_prose(" ".join(part.verdict for part in parts), console)
     cells = counted(len(done.cells), "cell(s)")
-    console.print(f"{cells} in {done.output}, tables in {REPORT}, plots in ENVIRONMENT.html")
+    console.print(f"{cells} in {done.output}: tables in {REPORT}, plots in a page by environment")
     return int(bool(done.reasons))

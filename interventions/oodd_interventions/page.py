@@ -32,7 +32,6 @@ from oodd_interventions.columns import (
 Records: TypeAlias = Sequence[InterventionRecord]
 
 REPORT: Final = "report.md"
-
 _SAVED, _PLACEBO, _HARM = "return_saved", "placebo_saved", "harm_on_nominal"
 _POINTS: Final = 200  # of a line in a plot, about
 _FEWEST: Final = 5  # seeds that can show something: a coin falls alike five times in 6 %
@@ -49,9 +48,10 @@ def sections(records: Records) -> list[Section]:
     """
     acts = dict.fromkeys(record["act"] for record in records)
     parts = [_of_act(act, [r for r in records if r["act"] == act]) for act in acts]
-    rows = {row_of(r): r for r in _overall(records) if _value(r, "named_precision") > -1}
-    title = "Parts named at the alarm (onset error in rows, the rest in %)"
-    named = [_table(title, [*rows.values()], NAMINGS)] * bool(rows)
+    act = next(iter(acts))
+    rows = [r for r in _overall(records) if r["act"] == act and _value(r, "named_precision") > -1]
+    title = f"Parts named at alarms under faults of {act} (onset error in rows, the rest in %)"
+    named = [_table(title, rows, NAMINGS)] * bool(rows)
     notes = ["The return is the sum of an episode's rewards; [95 % intervals] are over seeds."]
     notes += [f"{info.title}: {info.summary}." for info in INTERVENTIONS.values()]
     return [*parts, Section("Namings, and what the columns are", tables=named, notes=notes)]
@@ -64,13 +64,14 @@ def _of_act(act: str, records: Records) -> Section:
     several = len({r["environment"] for r in cells}) > 1
     saved: dict[str, dict[str, str]] = {}
     for r in (r for r in records if r["environment"] != ALL and several == (r["anomaly"] == ALL)):
-        name = r["environment" if several else "anomaly"]
-        saved.setdefault(row_of(r), {})[name] = f"{_text(r, _SAVED)} ({_text(r, _PLACEBO)})"
-    names = in_order((name for of_row in saved.values() for name in of_row), ENVIRONMENTS)
+        if not math.isnan(_value(r, _SAVED)):  # else what it cannot mend has a table of its own
+            name = r["environment" if several else "anomaly"]
+            saved.setdefault(name, {})[row_of(r)] = f"{_text(r, _SAVED)} ({_text(r, _PLACEBO)})"
+    names = in_order(saved, ENVIRONMENTS)
     lines = []
     for r in rows:
         overall = [_ends(r["intervention"][_SAVED]), _text(r, _PLACEBO), _text(r, _HARM)]
-        lines.append([row_of(r), *overall, *(saved[row_of(r)].get(name, "") for name in names)])
+        lines.append([row_of(r), *overall, *(saved[name].get(row_of(r), "") for name in names)])
     behind = [
         f"{row_of(r)} is {_ends(test)} behind {test['row']}, p {test['p']:.2g}"
         for r in rows
@@ -101,8 +102,9 @@ def _verdict(act: str, best: InterventionRecord, seeds: int) -> str:
     return (
         f"The alarm of {row_of(best)} is {doubt}worth having: {act} at the alarm saves "
         f"{_ends(saved)} % of the return that {act} at once, on the true parts, would save; "
-        f"at another episode's alarm it saves {_text(best, _PLACEBO)} %, and false alarms cost "
-        f"{_text(best, _HARM)} % of a healthy episode's return."
+        f"at another episode's alarm it saves {_text(best, _PLACEBO)} %. Of the nominal return "
+        f"false alarms cost {_text(best, _HARM)} %, and acting where nothing needs it "
+        f"{_text(best, 'availability_cost')} %."
     )
 
 

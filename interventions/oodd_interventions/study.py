@@ -35,7 +35,7 @@ from oodd_eval.data import layout
 from oodd_eval.data.facts import Group, SplitDefinition
 from oodd_eval.data.files import only_writer, write_text
 from oodd_eval.data.parts import EnvironmentData
-from oodd_eval.data.registry import register
+from oodd_eval.data.registry import inner_of, register
 from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import SimulationError, UnknownNameError, UsageError
 from oodd_eval.metrics.alarms import Calibration, GuaranteedAlarm
@@ -137,7 +137,8 @@ class StudyCell:
     @property
     def file(self) -> Path:
         """Its file, which is whole or absent."""
-        directory = self.study.output / "cells" / self.unit.environment / _plain_name(self.unit)
+        name = self.unit.setting.detector.replace(":", "-")  # as a directory can have it
+        directory = self.study.output / "cells" / self.unit.environment / name
         return directory / f"{self.record.condition}--{self.act.name}.json"
 
     def identity(self) -> dict[str, Any]:
@@ -277,10 +278,7 @@ def _selected(names: str, offered: Sequence[ActSpec], broken: Mapping[str, str])
 
 def source_of(act: ActSpec) -> str:
     """Return the digest of a foreign act's code, so that a change of it is run; else nothing."""
-    make = act.make
-    while isinstance(make, functools.partial):
-        make = make.func
-    module = getattr(make, "__module__", "oodd_interventions.")
+    module = getattr(inner_of(act.make), "__module__", "oodd_interventions.")
     return "" if module.startswith(_SHIPPED) else source_digest(module)
 
 
@@ -443,11 +441,6 @@ def run_cells(cells: Sequence[StudyCell]) -> dict[str, str]:
 def _name_of(unit: Unit) -> str:
     """Return the name of a detector in an environment, in reasons."""
     return f"{unit.environment}/{unit.setting.detector}"
-
-
-def _plain_name(unit: Unit) -> str:
-    """Return a detector's name as a directory can have it."""
-    return unit.setting.detector.replace(":", "-")
 
 
 def _definition(split: Path, environment: str) -> SplitDefinition:
