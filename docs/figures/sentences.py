@@ -337,7 +337,7 @@ SETTINGS = (
     r"within (?:20|100) (?:control )?(?:steps|rows)|most 300 (?:steps|transitions)",
     r"(?:[Pp]rotocol|Tables?|Fern) \d+(?: (?:to|and) \d+)?|Python 3\.11",
     r"50 % is chance|longer after 150 steps|first 60 rows|1, 5, 10, 25 and 100 %",
-    r"10 test episodes each|where 5 % were promised",
+    r"10 test episodes each|where 5 % were promised|let the loss grow by 25 %|Alarms at 5 %",
     r"600 times cheaper",  # says another paper
 )
 """What the reader is told of the settings and by others, which no result decides."""

@@ -287,6 +287,11 @@ TABLES: dict[str, Row] = {
     "mask": of_study("Return saved by mask"),
     "mask costs": of_study("What mask prevents"),
     "mask harmless": of_study("Faults that mask cannot mend"),
+    "stop": of_study("Return saved by stop"),
+    "stop costs": of_study("What stop prevents"),
+    "switch": of_study("Return saved by switch"),
+    "switch costs": of_study("What switch prevents"),
+    "stop harmless": of_study("Faults that stop cannot mend"),
     "namings": of_study("Parts named"),
     "worth": worth,
 }
