@@ -18,8 +18,14 @@ from oodd_recording.registered import info_of
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import ContractError
 from oodd_eval.metrics.alarms import GuaranteedAlarm
-from oodd_eval.plugins.explanations import Naming, checked_explanation, explains, naming_of
+from oodd_eval.plugins.explanations import (
+    ExplainingDetector,
+    Naming,
+    checked_explanation,
+    naming_of,
+)
 from oodd_interventions.acts import failed
+from oodd_interventions.columns import ARMS
 from oodd_interventions.situation import Act, ActSpec, Situation
 
 Row = NDArray[np.float32]
@@ -28,6 +34,8 @@ RENAMED: Final = (1, 2, 3, 4, 5, 20)
 """Rows after an alarm at which its parts are named again."""
 KEPT: Final = (0, 20)
 """Rows after an alarm whose namings a cell keeps."""
+PARTS: Final = ("sensors", "actuators")
+"""Fields of a naming that have a probability for each part."""
 FIRST: Final = -20
 """First row of curves, relative to the effect."""
 
@@ -93,10 +101,10 @@ class FittedDetector:
     def name(self, episode: Trajectory, _: int = 0) -> NamedParts:
         """Return what it names at the last row of an episode; nothing where it does not explain."""
         visible, last = self.handle.visible(episode), len(episode) - 1
-        if not explains(self.handle.detector):
+        detector = self.handle.detector
+        if not isinstance(detector, ExplainingDetector):
             sensors = np.zeros(visible.observation_dim)
             return NamedParts(Naming(sensors, np.zeros(0), sensors + math.nan), last)
-        detector: Any = self.handle.detector
         explanation = checked_explanation(detector.explain(visible), visible)
         naming = explanation.naming or naming_of(explanation, visible.action_dim)
         onset = int(explanation.onsets[-1])
@@ -223,9 +231,8 @@ def run_cell(
         ``"episodes"`` and ``"curves"`` of a raw cell, plain JSON.
     """
     alarms = [detector.alarm(pair.never) for pair in pairs]
-    watchdogs = [
-        loop.arm(pair, spec, row, detector.name) for pair, row in zip(pairs, alarms, strict=True)
-    ]
+    alarmed = zip(pairs, alarms, strict=True)
+    watchdogs = [loop.arm(pair, spec, row, detector.name) for pair, row in alarmed]
     replays = [_replayed(arm.namings) for arm in watchdogs]
     arms_of, episodes = [], []
     for i, pair in enumerate(pairs):
@@ -242,12 +249,11 @@ def run_cell(
             "forced": loop.arm(pair, spec, alarms[i], replays[i], nominal=True),
         }
         arms_of.append(arms)
-        facts = {"alarm": alarms[i], "false_alarm": rung, **_naming(loop.model, pair, watchdogs[i])}
+        facts = {name: getattr(pair.never, name) for name in ("seed", "onset", "effect")}
+        facts |= {"alarm": alarms[i], "false_alarm": rung}
+        facts |= _naming(loop.model, pair, watchdogs[i])
         episodes.append(
             {
-                "seed": pair.never.seed,
-                "onset": pair.never.onset,
-                "effect": pair.never.effect,
                 **facts,
                 "returns": {name: return_of(arm.episode) for name, arm in arms.items()},
                 "rows": {name: len(arm.episode.rewards) for name, arm in arms.items()},
@@ -256,10 +262,7 @@ def run_cell(
             }
         )
     effects = [pair.never.effect or 0 for pair in pairs]
-    curves = {
-        name: _curve([arms[name].episode.rewards for arms in arms_of], effects)
-        for name in (arms_of[0] if arms_of else ())
-    }
+    curves = {name: _curve([arms[name] for arms in arms_of], effects) for name in ARMS}
     return {"episodes": episodes, "curves": {"first": FIRST, "arms": curves}}
 
 
@@ -271,28 +274,22 @@ def _replayed(namings: Mapping[int, NamedParts]) -> Namer:
 def _naming(model: ReadingModel, pair: LoopPair, watchdog: LoopArm) -> dict[str, Any]:
     """Return the parts at fault, those that were named, and the sensors with large readings."""
     truth, rows = pair.truth().naming, watchdog.episode.trajectory.observations
-    faulty = {
-        part: np.flatnonzero(getattr(truth, part)).tolist() for part in ("sensors", "actuators")
-    }
+    faulty = {part: np.flatnonzero(getattr(truth, part)).tolist() for part in PARTS}
     named, largest = {}, {}
     for since, (naming, onset) in watchdog.namings.items():
         if since in KEPT:
-            probabilities = naming.sensors.tolist(), naming.actuators.tolist()
-            values = (*probabilities, naming.kind, onset)
-            named[str(since)] = dict(
-                zip(("sensors", "actuators", "kind", "onset"), values, strict=True)
-            )
+            probabilities = {part: getattr(naming, part).tolist() for part in PARTS}
+            named[str(since)] = {**probabilities, "kind": naming.kind, "onset": onset}
             t = len(rows) - 1 if watchdog.acted is None else watchdog.acted + since
             distances = np.abs(rows[t] - model.sensors.mean) / model.sensors.std
             largest[str(since)] = np.argsort(-distances, kind="stable").tolist()
     return {"parts": {**faulty, "kind": truth.kind}, "named": named, "largest": largest}
 
 
-def _curve(rewards: Sequence[NDArray[np.float32]], effects: Sequence[int]) -> list[float]:
+def _curve(arms: Sequence[LoopArm], effects: Sequence[int]) -> list[float]:
     """Return the mean rewards by row from `FIRST` on; rows after an end count 0."""
     # An effect is at row 30 or later, as every onset is.
-    parts = [of[effect + FIRST :] for of, effect in zip(rewards, effects, strict=True)]
-    table = np.zeros((len(parts), max(map(len, parts))))
-    for row, part in zip(table, parts, strict=True):
-        row[: len(part)] = part
+    parts = [arm.episode.rewards[t + FIRST :] for arm, t in zip(arms, effects, strict=True)]
+    size = max(map(len, parts))
+    table = np.array([np.pad(part, (0, size - len(part))) for part in parts], np.float64)
     return [float(f"{reward:.6g}") for reward in table.mean(axis=0)]
