@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.plugins.explanations import Naming
+from oodd_eval.plugins.explanations import NAMED, Naming
 from oodd_interventions.situation import Situation
 
 Row = NDArray[np.float32]
@@ -27,8 +27,6 @@ FARTHEST: Final = 10.0
 """Largest distance from the mean that a value may have, in training standard deviations."""
 LARGEST: Final = 1e4
 """Largest size of a fault, and variance of an estimate, standardized."""
-NAMED: Final = 0.5
-"""Least probability of a sensor that is named."""
 
 
 class VirtualSensor:
@@ -80,16 +78,14 @@ class VirtualSensor:
     def _standard(self, t: int) -> Floats:
         """Return row number t, the first one before it, standardized."""
         scale = self._situation.model.sensors
-        standard: Floats = (self._situation.rows[max(t, 0)] - scale.mean) / scale.std
-        return standard
+        return np.asarray((self._situation.rows[max(t, 0)] - scale.mean) / scale.std)
 
     def _command(self, t: int) -> Floats:
         """Return command number t, standardized; the mean before the first."""
         scale = self._situation.model.actions
         if t < 0:
             return np.zeros_like(scale.mean)
-        standard: Floats = (self._situation.actions[t] - scale.mean) / scale.std
-        return standard
+        return np.asarray((self._situation.actions[t] - scale.mean) / scale.std)
 
     def _begin(self) -> None:
         """Begin before the onset, with the sensors that are named now."""
@@ -104,8 +100,7 @@ class VirtualSensor:
         # Values of the named sensors now and one row before, and their covariance.
         start = max(self._situation.onset - EARLIER, 0)
         self._next = min(start, len(self._situation.rows) - 1)
-        before = [self._standard(self._next - lag)[named] for lag in (1, 2)]
-        self._values = np.concatenate(before)
+        self._values = np.concatenate([self._standard(self._next - i)[named] for i in (1, 2)])
         self._covariance = np.zeros((2 * len(named), 2 * len(named)))
         self._forward = np.hstack([self._parts[0][:, named], self._parts[1][:, named]])
 
