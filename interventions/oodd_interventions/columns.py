@@ -12,6 +12,7 @@ for the detectors and the kinds of an environment.
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from operator import itemgetter
 from typing import Any, Final, TypeAlias
 
 import numpy as np
@@ -23,6 +24,7 @@ from oodd_eval.metrics.bootstrap import drawn_cell, mean_interval, mean_over_cel
 from oodd_eval.metrics.catalogue import ATTRIBUTION, HEADLINE, INTERVENTIONS, metric_info
 from oodd_eval.metrics.ranking import Position, differences
 from oodd_eval.plugins.explanations import KINDS, NAMED
+from oodd_eval.results.board import grouped
 from oodd_eval.results.identity import Setting
 
 RawCell: TypeAlias = Mapping[str, Any]
@@ -65,13 +67,12 @@ def records_of(cells: Sequence[RawCell]) -> list[InterventionRecord]:
     """
     parts = [(cell, _terms(cell)) for cell in sorted(cells, key=_key)]
     behind = _behind(parts)
-    records = []
-    for scope in (4, 3, 2):
-        groups: dict[tuple[str, ...], list[tuple[RawCell, _Terms]]] = {}
-        for part in parts:
-            groups.setdefault(_key(part[0])[:scope], []).append(part)
-        records += [_record(group, scope, behind.get(key, {})) for key, group in groups.items()]
-    return records
+
+    def of(scope: int) -> list[InterventionRecord]:
+        groups = grouped(parts, lambda part: _key(part[0])[:scope])
+        return [_record(group, scope, behind.get(key, {})) for key, group in groups.items()]
+
+    return [*of(4), *of(3), *of(2)]
 
 
 def _key(cell: RawCell) -> tuple[str, str, str, str]:
@@ -104,10 +105,8 @@ def _figure(parts: _Parts, name: str) -> dict[str, float]:
 
 def _pooled(terms: Iterable[tuple[str, Contribution]]) -> dict[str, Contribution]:
     """Return ratios of sums over the cells of each environment, which have the same seeds."""
-    groups: dict[str, list[Contribution]] = {}
-    for environment, contribution in terms:
-        groups.setdefault(environment, []).append(contribution)
-    terms_of = {e: [(c.numerator, c.denominator) for c in group] for e, group in groups.items()}
+    groups = grouped(terms, itemgetter(0)).items()
+    terms_of = {e: [(c.numerator, c.denominator) for _, c in group] for e, group in groups}
     return {e: Contribution(*np.sum(of, axis=0)) for e, of in terms_of.items()}
 
 

@@ -45,6 +45,7 @@ from oodd_eval.plugins.contract import StorableDetector
 from oodd_eval.plugins.discovery import Plugins, describe, discover
 from oodd_eval.plugins.state import pack, read_state, write_state
 from oodd_eval.prose import terminal_text
+from oodd_eval.results.board import grouped
 from oodd_eval.results.record import Record, gather
 from oodd_eval.scoring.plan import Unit, make_plan, source_digest
 from oodd_interventions.acts import ACTS
@@ -304,11 +305,8 @@ def _run(cells: Sequence[StudyCell], jobs: int | None, observer: Progress) -> di
                 failure = _failure(fitting, fits[fitting])
                 observer(done, len(cells), f"{fits[fitting]} {'failed' if failure else 'fitted'}")
                 reasons |= failure
-            batches: dict[str, list[StudyCell]] = {}
-            for cell in missing:
-                if _name_of(cell.unit) not in reasons:
-                    shared = f"{cell.unit.environment}/{cell.record.condition}"
-                    batches.setdefault(shared, []).append(cell)
+            fitted = [cell for cell in missing if _name_of(cell.unit) not in reasons]
+            batches = grouped(fitted, lambda c: f"{c.unit.environment}/{c.record.condition}")
             tasks = {pool.submit(run_cells, batch): name for name, batch in batches.items()}
             for future in as_completed(tasks):
                 reasons |= _failure(future, tasks[future]) or future.result()
