@@ -298,23 +298,19 @@ def _run(cells: Sequence[StudyCell], jobs: int | None, observer: Progress) -> di
     missing = [cell for cell in cells if cell.read() is None]
     done, reasons = len(cells) - len(missing), dict[str, str]()
     with workers(jobs) as pool:
-        try:
-            units = {_name_of(cell.unit): (cell.study, cell.unit) for cell in missing}
-            fits = {pool.submit(fit, *units[name]): name for name in units}
-            for fitting in as_completed(fits):
-                failure = _failure(fitting, fits[fitting])
-                observer(done, len(cells), f"{fits[fitting]} {'failed' if failure else 'fitted'}")
-                reasons |= failure
-            fitted = [cell for cell in missing if _name_of(cell.unit) not in reasons]
-            batches = grouped(fitted, lambda c: f"{c.unit.environment}/{c.record.condition}")
-            tasks = {pool.submit(run_cells, batch): name for name, batch in batches.items()}
-            for future in as_completed(tasks):
-                reasons |= _failure(future, tasks[future]) or future.result()
-                done += len(batches[tasks[future]])
-                observer(done, len(cells), tasks[future])
-        except BaseException:  # an interrupt, too, does not wait for what is running now
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+        units = {_name_of(cell.unit): (cell.study, cell.unit) for cell in missing}
+        fits = {pool.submit(fit, *units[name]): name for name in units}
+        for fitting in as_completed(fits):
+            failure = _failure(fitting, fits[fitting])
+            observer(done, len(cells), f"{fits[fitting]} {'failed' if failure else 'fitted'}")
+            reasons |= failure
+        fitted = [cell for cell in missing if _name_of(cell.unit) not in reasons]
+        batches = grouped(fitted, lambda c: f"{c.unit.environment}/{c.record.condition}")
+        tasks = {pool.submit(run_cells, batch): name for name, batch in batches.items()}
+        for future in as_completed(tasks):
+            reasons |= _failure(future, tasks[future]) or future.result()
+            done += len(batches[tasks[future]])
+            observer(done, len(cells), tasks[future])
     return reasons
 
 

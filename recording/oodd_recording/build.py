@@ -362,13 +362,9 @@ def _run(chunks: list[Chunk], work: Path, jobs: int | None) -> Iterator[Chunk]:
         return
     with workers(jobs) as pool:
         running = {pool.submit(record_chunk, chunk, work): chunk for chunk in chunks}
-        try:
-            for future in as_completed(running):
-                future.result()
-                yield running[future]
-        except BaseException:  # an interrupt, too, does not wait for what is recorded now
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+        for future in as_completed(running):
+            future.result()
+            yield running[future]
 
 
 _AVX512: Final = {"SkylakeX", "Cooperlake", "SapphireRapids"}
@@ -388,7 +384,11 @@ def workers(jobs: int | None) -> Iterator[ProcessPoolExecutor]:
         patch.dict(os.environ, alike),
         ProcessPoolExecutor(count, context, _begin, (registered(), dict(MEASURED))) as pool,
     ):
-        yield pool
+        try:
+            yield pool
+        except BaseException:  # an interrupt, too, does not wait for what is running now
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
 
 
 def _begin(specs: Sequence[Spec], measured: Mapping[str, Measured]) -> None:
