@@ -14,9 +14,9 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Any, Final
 
 from oodd_common.naming import ReadingModel
 from oodd_live.handle import DetectorHandle
@@ -54,8 +54,6 @@ from oodd_interventions.loop import FittedDetector, Loop, LoopArm, LoopPair, run
 from oodd_interventions.page import sections
 from oodd_interventions.situation import ActSpec
 
-DETECTOR: Final = "detector."
-"""Prefix of a detector's arrays in the file of its fit."""
 SCHEMA: Final = "oodd-eval/intervention/1"
 IDENTITY: Final = (
     "detector",
@@ -332,11 +330,9 @@ def fit(study: Study, unit: Unit) -> None:
     if file.exists() or not isinstance(detector, StorableDetector):
         return
     fitted = _fitted(study, unit)
-    state = pack(cast(StorableDetector, fitted.handle.detector).state(), unit.setting.detector)
     scale = fitted.rule.standardization
-    rule = [fitted.rule.threshold, *(astuple(scale) if scale else ())]
-    arrays = {DETECTOR + name: array for name, array in state.arrays.items()}
-    write_state(file, pack({"rule": rule, "detector": state.values(), **arrays}))
+    rule = [fitted.rule.threshold, *(scale.numbers if scale else ())]
+    write_state(file, pack({"rule": rule, **fitted.handle.fitted()}))
 
 
 def _fitted(study: Study, unit: Unit) -> FittedDetector:
@@ -352,8 +348,7 @@ def _restored(study: Study, unit: Unit) -> FittedDetector:
     if not (file := study.fit_file(unit)).exists():
         return _fitted(study, unit)
     state, handle = read_state(file).state(), _handle(unit)
-    arrays = {n.removeprefix(DETECTOR): a for n, a in state.items() if n.startswith(DETECTOR)}
-    cast(StorableDetector, handle.detector).restore({**state["detector"], **arrays})
+    handle.restore(state)
     threshold, *scale = map(float, state["rule"])
     rule = GuaranteedAlarm(Standardization(*scale) if scale else None, threshold)
     return FittedDetector(handle, rule)

@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Self
+from typing import Any, Final, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from oodd_eval.names import read, whole_number
 from oodd_eval.plugins.contract import (
     AnyDetector,
     Detector,
+    StorableDetector,
     StreamingDetector,
     factory_of,
     float_scores,
@@ -24,6 +25,10 @@ from oodd_eval.plugins.contract import (
 )
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.plugins.explanations import ExplainingDetector
+from oodd_eval.plugins.state import State, pack
+
+DETECTOR: Final = "detector."
+"""Prefix of a detector's arrays among those of a state that it is part of."""
 
 Row = NDArray[np.float32]
 Floats = NDArray[np.float64]
@@ -115,6 +120,18 @@ class DetectorHandle:
             raise ContractError(f"score returned an array of shape {scores.shape}, {expected}")
         rows = base.rows if base else 0
         return undefined(scores[len(scores) - len(trajectory) + rows :], rows)
+
+    def fitted(self) -> dict[str, Any]:
+        """Return the fit of a detector that is storable, as part of a state."""
+        detector = cast(StorableDetector, self.detector)
+        packed = pack(detector.state(), self.state["name"] or type(detector).__name__)
+        arrays = {DETECTOR + name: array for name, array in packed.arrays.items()}
+        return {"detector": packed.values(), **arrays}
+
+    def restore(self, state: State) -> None:
+        """Take up the fit of a detector that is storable, from a state that has `fitted`."""
+        arrays = {n.removeprefix(DETECTOR): a for n, a in state.items() if n.startswith(DETECTOR)}
+        cast(StorableDetector, self.detector).restore({**state["detector"], **arrays})
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any], detector: AnyDetector | None) -> Self:

@@ -43,8 +43,6 @@ from oodd_live.reading import EpisodeAlarm, Reading, RunLength
 from oodd_live.stream import OBSERVATION, Stream
 
 KIND: Final = "watchdog/4"
-DETECTOR: Final = "detector."
-"""Prefix of the detector's arrays among those of a saved watchdog."""
 
 Floats = NDArray[np.float64]
 
@@ -557,7 +555,6 @@ class Watchdog:
         if not isinstance(detector, StorableDetector):
             problem = f"{type(detector).__name__} has no state and restore"
             raise UsageError(f"{problem}: fit the watchdog anew where it is needed")
-        fitted = pack(detector.state(), type(detector).__name__)
         scale, calibration = self.rule.standardization, self.calibration
         values = {
             "made": self._handle.state,
@@ -582,11 +579,10 @@ class Watchdog:
         state = {
             "kind": KIND,
             "watchdog": values,
-            "detector": fitted.values(),
             **self._scale.arrays(),
             "rest": self._rest,
             **self._nominal.arrays(),
-            **{DETECTOR + name: array for name, array in fitted.arrays.items()},
+            **self._handle.fitted(),
         }
         write_state(Path(path), pack(state, "the watchdog"))
 
@@ -661,12 +657,7 @@ class Watchdog:
         )
         rule = GuaranteedAlarm(standardization, _finite(values["threshold"]))
         length = length and RunLength(*map(_finite, length))
-        arrays = {
-            name.removeprefix(DETECTOR): array
-            for name, array in state.items()
-            if name.startswith(DETECTOR)
-        }
-        handle.detector.restore({**state["detector"], **arrays})
+        handle.restore(state)
         notes = [str(note) for note in values["notes"]]
         return cls(handle, calibration, rule, tail, stream, rest, nominal, settings, length, notes)
 
