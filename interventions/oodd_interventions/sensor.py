@@ -118,12 +118,8 @@ class VirtualSensor:
         uncertain = spread @ self._forward.T + self._situation.model.covariance
         # Values now and before, and how they go along with the readings.
         values = np.concatenate([forecast[named], self._values[:k]])
-        covariance = np.block(
-            [
-                [uncertain[np.ix_(named, named)], spread[named, :k]],
-                [spread[named, :k].T, self._covariance[:k, :k]],
-            ]
-        )
+        newest, across = uncertain[np.ix_(named, named)], spread[named, :k]
+        covariance = np.block([[newest, across], [across.T, self._covariance[:k, :k]]])
         joint = np.hstack([uncertain[:, named], spread[:, :k]])[self._read]
         innovation = uncertain[np.ix_(self._read, self._read)] + self._noise
         gain = np.linalg.solve(innovation, joint).T
