@@ -86,7 +86,7 @@ def _record(parts: _Parts, scope: int, behind: Mapping[str, Any]) -> Interventio
     if scope < 4:
         record |= dict.fromkeys(("environment", "anomaly", "group")[scope - 2 :], ALL)
     else:
-        record["returns"] = {arm: float(_returns(cell, arm).mean()) for arm in ARMS}
+        record["returns"] = {arm: float(_by_episode(cell, "returns", arm).mean()) for arm in ARMS}
     if behind:
         record["behind"] = behind
     record["intervention"] = {name: _figure(parts, name) for name in COLUMNS}
@@ -110,24 +110,22 @@ def _pooled(terms: Iterable[tuple[str, Contribution]]) -> dict[str, Contribution
     return {e: Contribution(*np.sum(of, axis=0)) for e, of in terms_of.items()}
 
 
-def _returns(cell: RawCell, arm: str) -> Any:
-    return np.array([episode["returns"][arm] for episode in cell["episodes"]])
+def _by_episode(cell: RawCell, field: str, arm: str) -> Any:
+    return np.array([episode[field][arm] for episode in cell["episodes"]], np.float64)
 
 
 def _terms(cell: RawCell) -> _Terms:
     """Return the terms of each column by episode."""
     episodes = cell["episodes"]
-    nominal = abs(_returns(cell, "twin").mean()) or math.nan
+    nominal = abs(_by_episode(cell, "returns", "twin").mean()) or math.nan
     twin, never, watchdog, oracle, placebo, false, forced = (
-        _returns(cell, arm) / nominal for arm in ARMS
+        _by_episode(cell, "returns", arm) / nominal for arm in ARMS
     )
     pays = (oracle - never).mean() >= LEAST
     harmless = (twin - never).mean() < LEAST
-    fails, fails_still = (
-        np.array([e["failed"][arm] for e in episodes], float) for arm in ("never", "watchdog")
-    )
+    fails, fails_still = (_by_episode(cell, "failed", arm) for arm in ("never", "watchdog"))
     effects = np.array([e["effect"] for e in episodes], float)
-    acts = np.array([e["acted"]["watchdog"] for e in episodes], float)  # NaN without one
+    acts = _by_episode(cell, "acted", "watchdog")  # NaN without one
     unneeded = twin - false + harmless * (never - watchdog)
     return _naming(episodes) | {
         "return_saved": Contribution(pays * (watchdog - never), pays * (oracle - never)),
