@@ -72,11 +72,8 @@ def _of_act(act: str, records: Records) -> Section:
     for r in rows:
         overall = [_ends(r["intervention"][_SAVED]), _text(r, _PLACEBO), _text(r, _HARM)]
         lines.append([row_of(r), *overall, *(saved[name].get(row_of(r), "") for name in names)])
-    behind = [
-        f"{row_of(r)} is {_ends(test)} behind {test['row']}, p {test['p']:.2g}"
-        for r in rows
-        if (test := r.get("behind"))
-    ]
+    tests = {row_of(r): r["behind"] for r in rows if "behind" in r}
+    behind = [f"{row} is {_ends(t)} behind {t['row']}, p {t['p']:.2g}" for row, t in tests.items()]
     note = f"Paired by seeds: {'; '.join(behind)}." * bool(behind)
     title = f"Return saved by {act}, in brackets the placebo (%)"
     header = ["detector", "mean", "placebo", "harm on nominal", *names]
