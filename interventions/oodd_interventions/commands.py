@@ -60,15 +60,10 @@ def intervene(options: Options) -> int:
     """
     console, notes = make_console(), make_console(quiet=options.verbosity < 0)
     settings = {name: getattr(options, name) for name in _SETTINGS}
+    settings |= {"level": options.level / 100, "parameters": dict(options.param)}
+    settings["observer"] = lambda n, total, text: notes.print(f"{n}/{total}  {text}")
     try:
-        done = study.intervene(
-            options.detector,
-            options.env,
-            level=options.level / 100,
-            parameters=dict(options.param),
-            observer=lambda n, total, text: notes.print(f"{n}/{total}  {text}"),
-            **settings,
-        )
+        done = study.intervene(options.detector, options.env, **settings)
     except KeyboardInterrupt:
         say(f"what was done is kept in {options.output}; the same command continues")
         raise
