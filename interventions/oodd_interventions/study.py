@@ -374,8 +374,7 @@ def _data(split: Path, environment: str) -> EnvironmentData:
 def _loop(split: Path, environment: str) -> Loop:
     """Return policy, noise and cap of a split's environment, and a model of its readings."""
     definition = _definition(split, environment)
-    policy = load_policy(environment)
-    setup = Setup(environment, policy, definition.episode_cap, definition.noise)
+    setup = Setup(environment, load_policy(environment), definition.episode_cap, definition.noise)
     return Loop(setup, ReadingModel.fit(list(_data(split, environment).train)))
 
 
