@@ -154,10 +154,9 @@ def _naming(episodes: Sequence[Mapping[str, Any]]) -> _Terms:
     kinds, errors = [], []
     for row, fault, episode, naming in zip(namings, faulty, episodes, named, strict=True):
         true, first = episode["parts"], naming.get("0")
+        kind = true["kind"]
         fault[[*true["sensors"], *(sensors + i for i in true["actuators"])]] = True
-        kinds.append(
-            [KINDS.index(k) for k in KINDS if k == true["kind"] or {k, true["kind"]} <= _ALIKE]
-        )
+        kinds.append([i for i, k in enumerate(KINDS) if k == kind or {k, kind} <= _ALIKE])
         errors.append(abs(first["onset"] - episode["effect"]) if first else math.nan)
         if first:
             for time, at in enumerate((first, naming.get("20", first))):
