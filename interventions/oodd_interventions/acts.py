@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from oodd_recording.closed_loop import RecordedEpisode
 from oodd_recording.policies import CustomPolicy, Policy, load_policy
 from oodd_recording.registered import info_of
 
@@ -22,23 +23,17 @@ STANDING: Final = Path(__file__).with_name("standing")
 """Directory of policies that stand: linear, learnt under pushes and with weaker motors."""
 
 
-def failed(
-    environment: str, rewards: NDArray[np.float32], terminated: bool, cap: int, row: Row
-) -> bool:
+def failed(environment: str, episode: RecordedEpisode, cap: int) -> bool:
     """Tell whether an episode counts as a failure.
 
     Parameters
     ----------
     environment
         Its name.
-    rewards : float32 array of shape (T,)
-        Its rewards.
-    terminated
-        Whether the simulator ended it.
+    episode
+        One of its episodes.
     cap
         The longest episode, in transitions.
-    row : float32 array of shape (D,)
-        The last row.
 
     Returns
     -------
@@ -48,28 +43,23 @@ def failed(
         HalfCheetah, which the simulator lets go on, when it lies on its back or its nose.
     """
     if environment == "acrobot":
-        return not terminated
+        return not episode.terminated
     if environment == "lunarlander":
-        return not terminated or bool(rewards[-1] <= -100)
+        return not episode.terminated or bool(episode.rewards[-1] <= -100)
     if environment == "halfcheetah":
-        return bool(abs(row[7]) >= 1)
-    return terminated and len(rewards) < cap
-
-
-class Mask:
-    """The policy goes on, and gets estimates for the sensors that are named."""
-
-    def __init__(self, situation: Situation) -> None:
-        self._situation, self._sensor = situation, VirtualSensor(situation)
-
-    def act(self, row: Row) -> Any:
-        """Return the policy's command for the estimated row."""
-        return self._situation.policy.act(self._sensor.row(row))
+        return bool(abs(episode.trajectory.observations[-1, 7]) >= 1)
+    return episode.terminated and len(episode.rewards) < cap
 
 
 def controlled(command: Callable[[Row], Any], situation: Situation) -> Policy:
     """Let another controller take over: a function of the row."""
     return CustomPolicy(situation.environment, command)
+
+
+def mask(situation: Situation) -> Policy:
+    """Let the policy go on, with estimates for the sensors that are named."""
+    sensor = VirtualSensor(situation)
+    return controlled(lambda row: situation.policy.act(sensor.row(row)), situation)
 
 
 def balance(row: Row) -> int:
@@ -167,7 +157,7 @@ def _of(name: str, make: Callable[[Situation], Act], summary: str, *names: str) 
 _ROBOTS: Final = ("ant", "halfcheetah", "hopper", "walker2d")
 
 ACTS: Final = [
-    ActSpec("mask", Mask, "the policy gets estimates for the named sensors", ("sensor",)),
+    ActSpec("mask", mask, "the policy gets estimates for the named sensors", ("sensor",)),
     _of("stop", brace, "the joints go to the middles of their ranges", "ant"),
     _of("stop", stand, "a policy that has learnt to stand takes over", "hopper"),
     _of("stop", partial(controlled, descend), "the lander comes down where it is", "lunarlander"),

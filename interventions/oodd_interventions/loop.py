@@ -144,9 +144,9 @@ class Loop:
 
     def failed(self, episode: RecordedEpisode) -> bool:
         """Tell whether an episode counts as a failure."""
-        environment, last = self.setup.environment, episode.trajectory.observations[-1]
+        environment = self.setup.environment
         cap = min(filter(None, (info_of(environment).episode_cap, self.setup.episode_cap)))
-        return failed(environment, episode.rewards, episode.terminated, cap, last)
+        return failed(environment, episode, cap)
 
 
 class _TakingOver:

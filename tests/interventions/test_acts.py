@@ -15,11 +15,11 @@ import oodd_worlds
 from oodd_common.naming import ReadingModel
 from oodd_interventions.acts import ACTS, Compensated, failed
 from oodd_interventions.loop import Loop, LoopPair, NamedParts
-from oodd_recording.closed_loop import Setup, measure, record_anomalous, return_of
+from oodd_recording.closed_loop import RecordedEpisode, Setup, measure, record_anomalous, return_of
 from oodd_recording.policies import load_policy
 from oodd_recording.registered import info_of
 
-from oodd_eval import Naming
+from oodd_eval import Naming, Trajectory
 from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_eval.data.registry import register
 
@@ -129,7 +129,7 @@ def test_the_tanks_reach_their_fail_safe_set_points():
 def test_a_robot_stands_on_its_feet(environment):
     episode = forced(environment, act_of("stop", environment), cap=400)[1]
     assert len(episode.rewards) == 400
-    assert not failed(environment, episode.rewards, False, 400, episode.trajectory.observations[-1])
+    assert not failed(environment, episode, 400)
     # Columns 3 to 5 are 0.3 times the velocity.
     assert np.abs(episode.trajectory.observations[-100:, 3].mean()) < 0.15
 
@@ -186,15 +186,17 @@ def test_a_push_on_all_motors_is_found_and_taken_off():
     ],
 )
 def test_failures_are_those_of_the_task(environment, reward, terminated, pitch, expected):
-    row = np.zeros(26, np.float32)
-    row[7] = pitch
+    rows = np.zeros((21, 26), np.float32)
+    rows[-1, 7] = pitch
     rewards = np.full(20, reward, np.float32)
-    assert failed(environment, rewards, terminated, 30, row) is expected
+    episode = RecordedEpisode(Trajectory(rows), rewards, terminated, SEED)
+    assert failed(environment, episode, 30) is expected
 
 
 def test_an_end_at_the_cap_is_no_failure():
-    row = np.zeros(4, np.float32)
-    assert not failed("cartpole", np.ones(30, np.float32), True, 30, row)
+    rows = np.zeros((31, 4), np.float32)
+    episode = RecordedEpisode(Trajectory(rows), np.ones(30, np.float32), True, SEED)
+    assert not failed("cartpole", episode, 30)
 
 
 @pytest.mark.slow
