@@ -15,9 +15,7 @@ from oodd_recording.registered import info_of
 
 from oodd_eval import Trajectory
 from oodd_interventions.sensor import VirtualSensor
-from oodd_interventions.situation import Act, ActSpec, Situation
-
-Row = NDArray[np.float32]
+from oodd_interventions.situation import Act, ActSpec, Row, Situation
 
 STANDING: Final = Path(__file__).with_name("standing")
 """Directory of policies that stand: linear, learnt under pushes and with weaker motors."""

@@ -26,9 +26,7 @@ from oodd_eval.plugins.explanations import (
 )
 from oodd_interventions.acts import failed
 from oodd_interventions.columns import ARMS
-from oodd_interventions.situation import Act, ActSpec, Situation
-
-Row = NDArray[np.float32]
+from oodd_interventions.situation import Act, ActSpec, Row, Situation
 
 RENAMED: Final = (1, 2, 3, 4, 5, 20)
 """Rows after an alarm at which its parts are named again."""

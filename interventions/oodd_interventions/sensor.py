@@ -11,13 +11,10 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
+from oodd_common.charts import Floats
 
 from oodd_eval.plugins.explanations import NAMED, Naming
-from oodd_interventions.situation import Situation
-
-Row = NDArray[np.float32]
-Floats = NDArray[np.float64]
+from oodd_interventions.situation import Row, Situation
 
 TRUSTED: Final = 1e-6
 """Variance of a sensor that nobody names, standardized: for numerical safety."""

@@ -14,6 +14,8 @@ from oodd_recording.policies import Policy
 from oodd_eval import Naming
 from oodd_eval.data.facts import Group
 
+Row = NDArray[np.float32]
+
 
 @dataclass(slots=True)
 class Situation:
@@ -48,7 +50,7 @@ class Situation:
 class Act(Protocol):
     """What commands the environment from the row of an alarm on."""
 
-    def act(self, row: NDArray[np.float32]) -> Any:
+    def act(self, row: Row) -> Any:
         """Return the command for the next observation row.
 
         Parameters
