@@ -8,7 +8,7 @@ import shutil
 import tempfile
 import warnings
 import weakref
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,7 @@ import numpy as np
 
 from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import PromiseWarning, UsageError
-from oodd_eval.names import each_once, read, whole_number
+from oodd_eval.names import comma_list, each_once, read, whole_number
 from oodd_eval.plugins.contract import (
     AnyDetector,
     Detector,
@@ -144,7 +144,7 @@ def evaluate(
     if len({*names}) < len(names):
         raise UsageError(f"detectors {names}: expected a name for each, as DetectorSpec gives one")
     selected = opened.select(
-        read("environments", _listed, environments), read("anomalies", _listed, anomalies)
+        read("environments", comma_list, environments), read("anomalies", comma_list, anomalies)
     )
     plan = make_plan(
         plugins,
@@ -243,13 +243,6 @@ def _check_call(factory: Callable[..., Detector], name: str, arguments: Mapping[
 
 
 _count = partial(whole_number, least=1)
-
-
-def _listed(names: str | Iterable[str]) -> str:
-    several = [names] if isinstance(names, str) or not isinstance(names, Iterable) else [*names]
-    if all(isinstance(name, str) for name in several):
-        return ",".join(several)
-    raise UsageError(f"{names!r:.80}, expected names, or a text with commas between them")
 
 
 def _plain(parameters: Mapping[str, Any]) -> dict[str, Any]:

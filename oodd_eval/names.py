@@ -76,6 +76,18 @@ def select(kind: str, patterns: str, known: Iterable[str]) -> list[str]:
     return list(selected)
 
 
+def comma_list(names: str | Iterable[str]) -> str:
+    """Return names, or a text of names with commas between them, as such a text.
+
+    >>> comma_list("hopper,a*"), comma_list(["hopper", "ant"])
+    ('hopper,a*', 'hopper,ant')
+    """
+    several = [names] if isinstance(names, str) or not isinstance(names, Iterable) else [*names]
+    if all(isinstance(name, str) for name in several):
+        return ",".join(several)
+    raise UsageError(f"{names!r:.80}, expected names, or a text with commas between them")
+
+
 def natural(text: str) -> int:
     """Return the whole number from 0 on that at most 18 digits stand for; -1 for another text.
 

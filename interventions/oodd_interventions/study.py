@@ -40,7 +40,7 @@ from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import SimulationError, UnknownNameError, UsageError
 from oodd_eval.metrics.alarms import Calibration, GuaranteedAlarm
 from oodd_eval.metrics.cusum import Standardization
-from oodd_eval.names import read, select, whole_number
+from oodd_eval.names import comma_list, read, select, whole_number
 from oodd_eval.plugins.contract import StorableDetector
 from oodd_eval.plugins.discovery import Plugins, describe, discover
 from oodd_eval.plugins.state import pack, read_state, write_state
@@ -223,21 +223,21 @@ def intervene(
         raise UsageError(f"level is {level!r}, expected a share of episodes between 0 and 1")
     opened, plugins = load_split(split), discover()
     register([spec for spec, _ in plugins.custom_specs.values()])
-    environment_names, kind_names = opened.select(_listed(environments), _listed(kinds or "all"))
+    environment_names, kinds = opened.select(comma_list(environments), comma_list(kinds or "all"))
     for environment in environment_names:
         _check_recorded(opened, environment, base)
         measure(environment, load_policy(environment))
     plan = make_plan(
         plugins,
         split=opened,
-        detectors=plugins.select(_listed(detectors)),
+        detectors=plugins.select(comma_list(detectors)),
         environments=environment_names,
-        anomalies=kind_names,
+        anomalies=kinds,
         parameters=parameters,
     )
     offered = offered_acts(plugins)
     broken = {f"plug-in {b.plugin!r} of {b.distribution}": b.reason for b in plugins.broken}
-    act_names = _selected(_listed(acts or "all"), offered, broken)
+    act_names = _selected(comma_list(acts or "all"), offered, broken)
     study = Study(opened.path, Path(output), seeds, base, level)
     cells = [
         StudyCell(study, unit, plan.blank(unit, condition, status="ok"), act)
@@ -445,7 +445,3 @@ def _check_recorded(split: Split, environment: str, base: int) -> None:
         )
     if base == _definition(split.path, environment).seed_base:
         raise UsageError(f"base={base} is that of split {split.name}: expected another one")
-
-
-def _listed(names: Names) -> str:
-    return names if isinstance(names, str) else ",".join(names)
