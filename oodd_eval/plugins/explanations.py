@@ -26,7 +26,7 @@ _ROUNDING: Final = 1e-5  # of a sum of shares
 
 
 KINDS: Final = ("", "sensor", "actuator", "body", "environment")
-"""What a naming may say of where a fault is; an empty text where it says nothing."""
+"""Places that a naming may give to a fault; an empty text gives none."""
 
 
 class Naming(NamedTuple):

@@ -1,4 +1,4 @@
-"""Which parts are at fault, named as a set: sensors and actuators, by the evidence of sets.
+"""Names all sensors and actuators that are at fault at once, by the evidence of sets of them.
 
 A fault of a sensor is a reading that is its state and something else. It shows in the row itself,
 and in the forecasts of the next rows, which are made from it: so a faulty sensor is told from
@@ -50,7 +50,7 @@ NAMES: Final = ["sensors", "actions", "coefficients", "covariance", "price", "ru
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReadingModel:
-    """How readings follow from the two rows, and commands, before them in nominal operation.
+    """A linear forecast of nominal readings from the two rows, and commands, before them.
 
     Attributes
     ----------
@@ -95,8 +95,8 @@ class ReadingModel:
 
     def regressors(self, x: Trajectory) -> Floats:
         """Return what forecasts of the rows 1 to T are made of, (T, K)."""
-        known = x.actions if len(self.actions.mean) else x.actions[:, :0]
-        commands = (known - self.actions.mean) / self.actions.std
+        actions = x.actions if len(self.actions.mean) else x.actions[:, :0]
+        commands = (actions - self.actions.mean) / self.actions.std
         return regressors(StandardEpisode(self.standard(x), commands), 1, ORDER)
 
     def errors(self, x: Trajectory) -> Floats:
