@@ -50,7 +50,7 @@ def sections(records: Records) -> list[Section]:
     parts = [_of_act(act, [r for r in records if r["act"] == act]) for act in acts]
     act = next(iter(acts))
     rows = [r for r in _overall(records) if r["act"] == act and _value(r, "named_precision") > -1]
-    title = f"Parts named at alarms under faults of {act} (onset error in rows, the rest in %)"
+    title = f"Parts named at alarms for {act} to act on (onset error in rows, the rest in %)"
     named = [_table(title, rows, NAMINGS)] * bool(rows)
     notes = ["The return is the sum of an episode's rewards; [95 % intervals] are over seeds."]
     notes += [f"{info.title}: {info.summary}." for info in INTERVENTIONS.values()]
