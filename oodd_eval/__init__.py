@@ -31,6 +31,7 @@ __all__ = [
     "Quantity",
     "Trajectory",
     "__version__",
+    "calibrate",
     "check_detector",
     "evaluate",
     "hookimpl",
@@ -54,6 +55,7 @@ _NAMES = {
 _HOMES = {name: f"{__name__}.{home}" for home, names in _NAMES.items() for name in names}
 # Known by name alone: nothing here imports these packages.
 _HOMES |= {
+    "calibrate": "oodd_monitors",
     "check_detector": "oodd_checks",
     "import_frames": "oodd_logs",
     "intervene": "oodd_interventions",

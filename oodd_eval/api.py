@@ -137,7 +137,9 @@ def evaluate(
         raise UsageError("no detector was named: expected at least one")
     installed = any(isinstance(d, str) for d in tried)
     plugins = discover() if installed else discover(only=())
-    tried = [n for d in tried for n in (plugins.select(d) if isinstance(d, str) else [d])]
+    tried = [
+        n for d in tried for n in (plugins.select(d, opened.columns) if isinstance(d, str) else [d])
+    ]
     by_name = {d for d in tried if isinstance(d, str)}
     shared = {k: v for k, v in arguments.items() if "." not in k and k not in by_name}
     names = [_offer(plugins, d, shared) for d in tried]

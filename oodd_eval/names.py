@@ -15,8 +15,8 @@ Value = TypeVar("Value")
 Read = TypeVar("Read")
 
 DETECTOR_NAME: Final = r"[a-z0-9][a-z0-9-]{0,63}"
-SPEC_NAME: Final = DETECTOR_NAME + r"(:\w{1,64}(\.\w{1,64}){0,7})?"
-"""A detector's name, perhaps with a class behind a colon: it goes into tables, files and URLs."""
+SPEC_NAME: Final = DETECTOR_NAME + r"(:[-\w][-+\w ./%()\[\]]{0,127})?"
+"""A detector's name, perhaps with a class or column behind a colon: it goes into tables."""
 
 PARAMETER_NAME: Final = r"[A-Za-z_]\w{0,63}"
 

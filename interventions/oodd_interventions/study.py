@@ -230,7 +230,7 @@ def intervene(
     plan = make_plan(
         plugins,
         split=opened,
-        detectors=plugins.select(comma_list(detectors)),
+        detectors=plugins.select(comma_list(detectors), opened.columns),
         environments=environment_names,
         anomalies=kinds,
         parameters=parameters,

@@ -75,7 +75,7 @@ class DetectorHandle:
         """
         seed = read("seed", partial(whole_number, least=0), seed)
         horizon = read("horizon", partial(whole_number, least=1), horizon)
-        kind = next((kind for kind in STATISTICS if kind == statistic), None)
+        kind: AlarmKind | None = next((kind for kind in STATISTICS if kind == statistic), None)
         if kind is None and statistic is not None:
             expected = ", ".join(map(repr, STATISTICS))
             raise UsageError(f"statistic={statistic!r}, expected one of {expected}")

@@ -122,7 +122,7 @@ def run(options: Options) -> int:
     plan = make_plan(
         plugins,
         split=split,
-        detectors=plugins.select(options.detector),
+        detectors=plugins.select(options.detector, split.columns),
         environments=environments,
         anomalies=anomalies,
         horizons=options.horizon,

@@ -32,9 +32,10 @@ Role = Literal[
     "contact",
     "setpoint",
     "effort",
+    "score",
 ]
-_UNMEASURED: Final = ("reference", "memory", "setpoint")
-_STORED: Final = ("reference", "memory")  # with names; manifests list all roles
+_UNMEASURED: Final = ("reference", "memory", "setpoint", "score")
+_STORED: Final = ("reference", "memory", "score")  # with names; manifests list all roles
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +56,7 @@ class Quantity:
         or ``"effort"``. Velocities are x, y, z of one frame, in one unit up to a factor a column;
         one angle turns the plane of the first two, three are roll, pitch and yaw, and two are roll
         and pitch of velocities that yaw turns no more. Only what is measured has noise, or breaks.
+        A ``"score"`` is what a monitor computed when the log was recorded: no sensor.
     noise
         Standard deviation of the sensor's noise in nominal operation, in `unit`.
     """
@@ -97,7 +99,7 @@ class Quantity:
     def row(self) -> dict[str, Any]:
         """Name, unit, and what differs from its default, as files store them.
 
-        Of roles only references and memory are part of it, and so of digests.
+        Of roles only references, memory and scores are part of it, and so of digests.
         """
         row: dict[str, Any] = {"name": self.name, "unit": self.unit}
         row |= {"role": self.role} if self.role in _STORED else {}

@@ -37,7 +37,7 @@ from oodd_eval.data.facts import (
     roles_of,
 )
 from oodd_eval.data.files import Unfailing, replacing, write_text
-from oodd_eval.data.parts import CALIBRATION, NAMES, NOMINAL, TRAIN, TWINS, conditions_in
+from oodd_eval.data.parts import CALIBRATION, FAILURES, NAMES, NOMINAL, TRAIN, TWINS, conditions_in
 from oodd_eval.errors import SplitError
 
 SCHEMA: Final = 2
@@ -99,7 +99,7 @@ def dtypes_of(group: str, *, paired: bool = True) -> dict[str, str]:
     """Return names and dtypes of the datasets a group must have."""
     if paired:
         return dict(NOMINAL_DTYPES if group in NOMINAL else ANOMALOUS_DTYPES)
-    return dict(UNPAIRED_DTYPES if group in NOMINAL else LABELLED_DTYPES)
+    return dict(UNPAIRED_DTYPES if group in (*NOMINAL, FAILURES) else LABELLED_DTYPES)
 
 
 def check_layout(file: str, name: str, group: Mapping[str, Any], *, paired: bool = True) -> None:
@@ -404,7 +404,7 @@ def _manifest_schema() -> Any:
     by_name = core_schema.dict_schema
     name = core_schema.str_schema(pattern=f"^{NAME_PATTERN}$")
     parts = core_schema.str_schema(
-        pattern=f"^(train|calibration|test/{NAME_PATTERN}(@[a-z0-9.-]{{1,32}})?)$"
+        pattern=f"^(train|calibration|failures|test/{NAME_PATTERN}(@[a-z0-9.-]{{1,32}})?)$"
     )
     # Others trust these numbers with memory and disk.
     count = core_schema.int_schema(ge=0, le=10**10)

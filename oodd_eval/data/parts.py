@@ -4,9 +4,11 @@ Names, onsets and parameters stay with the harness; a detector is handed `Trajec
 """
 
 import contextlib
+import copy
 import functools
 import itertools
 import json
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final
@@ -29,6 +31,9 @@ TWINS: Final = "test/nominal"
 NOMINAL: Final = (TRAIN, CALIBRATION, TWINS)
 """The nominal parts, which every environment has. Each part is a group of its file."""
 
+FAILURES: Final = "failures"
+"""The part with failed episodes for training, which few environments have."""
+
 NAMES: Final = "names"  # the group that names the columns of observations and actions
 _ROWS: Final = 1 << 14  # transitions of a large part that are read at once
 _KEPT: Final = 1 << 24  # bytes up to which a part is decompressed once and kept
@@ -36,7 +41,8 @@ _KEPT: Final = 1 << 24  # bytes up to which a part is decompressed once and kept
 
 def conditions_in(groups: Iterable[str]) -> tuple[Condition, ...]:
     """Return the conditions among groups such as ``"test/iid"``, in the benchmark's order."""
-    tests = sorted(group.removeprefix("test/") for group in groups if group not in NOMINAL)
+    others = (*NOMINAL, FAILURES, NAMES)
+    tests = sorted(group.removeprefix("test/") for group in groups if group not in others)
     return tuple(in_suite_order(map(Condition.parse, tests)))
 
 
@@ -241,6 +247,33 @@ def check_twins(
             )
 
 
+class _Columns:
+    """Some columns of stored rows."""
+
+    def __init__(self, rows: Any, columns: list[int]) -> None:
+        self._rows, self._columns = rows, columns
+        self.nbytes = rows.nbytes
+
+    def __getitem__(self, rows: slice) -> NDArray[np.float32]:
+        block: NDArray[np.float32] = self._rows[rows]
+        return block[:, self._columns]
+
+
+def columns_named(columns: Sequence[Quantity], name: str, environment: str) -> list[int]:
+    """Return the numbers of the columns of a name, or of NAME[0], NAME[1] and so on.
+
+    Raises
+    ------
+    UnknownNameError
+        When an environment has none.
+    """
+    names = [column.name for column in columns]
+    block = [i for i, text in enumerate(names) if re.fullmatch(re.escape(name) + r"\[\d+\]", text)]
+    if name not in names and not block:
+        check_known(f"column of {environment}", names, name)
+    return [names.index(name)] if name in names else block
+
+
 class EnvironmentData:
     """The verified content of one environment, opened by `Split.environment`.
 
@@ -259,8 +292,12 @@ class EnvironmentData:
     anomalies
         Anomalies of this split, with ``@`` and the strength where there are several, as in
         ``iid@kept99``.
+    failures
+        Failed episodes to fit on, for detectors that learn from them; None where there are none.
     sensors, actions
         Names and units of the columns of observations and actions, of sensors also their roles.
+    columns
+        The sensors, and what monitors computed when the logs were recorded (role ``"score"``).
     discrete
         True when an action is a one-hot row.
     logs
@@ -285,10 +322,8 @@ class EnvironmentData:
         self.ledger = tuple(ledger)
         self.id, self.digest, self.discrete, self.logs = environment, digest, discrete, logs
         self._recordings = dict(recordings or {})
-        self._file, self._parts = file, parts
-        nominal = (TrajectorySet(parts, part) for part in NOMINAL)
-        self.train, self.calibration, self.twins = nominal
-        self.anomalies = tuple(map(str, conditions_in(part for part in parts if part != NAMES)))
+        self._file, self._stored = file, parts
+        self.anomalies = tuple(map(str, conditions_in(parts)))
         self.sensors, self.actions = (
             tuple(map(Quantity.read, map(json.loads, names[:])))
             for names in (parts[NAMES]["sensors"], parts[NAMES]["actions"])
@@ -296,6 +331,50 @@ class EnvironmentData:
         if roles:
             pairs = zip(self.sensors, roles, strict=True)
             self.sensors = tuple(replace(sensor, role=role) for sensor, role in pairs)
+        self.columns = self.sensors
+        sensors = [i for i, column in enumerate(self.columns) if column.role != "score"]
+        self._show(sensors if len(sensors) < len(self.columns) else None)
+
+    def of_columns(self, names: Sequence[str]) -> "EnvironmentData":
+        """Return the same episodes with some of their columns in place of the sensors.
+
+        Parameters
+        ----------
+        names
+            Of `columns`. NAME stands for the columns NAME[0], NAME[1] and so on, too.
+
+        Returns
+        -------
+        EnvironmentData
+            It reads the same file.
+
+        Raises
+        ------
+        UnknownNameError
+            When there is no such column.
+        """
+        numbers = [i for name in names for i in columns_named(self.columns, name, self.id)]
+        shown = copy.copy(self)
+        shown._show(numbers)  # noqa: SLF001  of this class
+        return shown
+
+    def _show(self, columns: list[int] | None) -> None:
+        """Let episodes have some of the stored columns as their sensors; None for all."""
+        self._parts = self._stored
+        if columns is not None:
+            self.sensors = tuple(self.columns[i] for i in columns)
+            self._parts = {
+                name: {**part, "observations": _Columns(part["observations"], columns)}
+                for name, part in self._stored.items()
+                if name != NAMES
+            }
+            if self.logs and self.logs.offsets:
+                offsets = tuple(self.logs.offsets[i] for i in columns)
+                self.logs = replace(self.logs, offsets=offsets)
+        nominal = (TrajectorySet(self._parts, part) for part in NOMINAL)
+        self.train, self.calibration, self.twins = nominal
+        failed = FAILURES in self._parts
+        self.failures = TrajectorySet(self._parts, FAILURES) if failed else None
 
     @property
     def baseline(self) -> int:
@@ -400,7 +479,7 @@ class EnvironmentData:
         dict
             Arrays by the names of the datasets.
         """
-        return {name: dataset[:] for name, dataset in self._parts[part].items()}
+        return {name: dataset[:] for name, dataset in self._stored[part].items()}
 
     def close(self) -> None:
         """Close the file."""

@@ -313,20 +313,28 @@ class Split:
         """
         return layout.roles_in(environment, self.manifest["environments"][environment])
 
-    def train_digest(self, environment: str) -> str:
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the columns of all environments, each once: sensors and recorded scores."""
+        entries = self.manifest["environments"].values()
+        return tuple(dict.fromkeys(row["name"] for entry in entries for row in entry["sensors"]))
+
+    def train_digest(self, environment: str, part: str = TRAIN) -> str:
         """Return the digest of an environment's training part: what a fit depends on.
 
         Parameters
         ----------
         environment
             One of `environments`.
+        part
+            Another part that it depends on.
 
         Returns
         -------
         str
             SHA-256, in hexadecimal digits.
         """
-        return str(self.manifest["environments"][environment]["groups"][TRAIN]["sha256"])
+        return str(self.manifest["environments"][environment]["groups"][part]["sha256"])
 
     def environment(self, name: str) -> EnvironmentData:
         """Open one environment after verifying every group's digest.

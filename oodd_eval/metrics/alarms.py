@@ -13,7 +13,7 @@ prediction; Lee, Barber & Willett, arXiv 2306.06342).
 import math
 from collections.abc import Collection, Hashable, Sequence
 from dataclasses import dataclass, replace
-from typing import Final, Literal, get_args
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,11 +28,15 @@ from oodd_eval.names import counted
 
 Floats = NDArray[np.float64]
 
-AlarmKind = Literal["cusum", "score"]
+AlarmKind = Literal["cusum", "score", "column", "flag"]
 """Statistic of the guaranteed alarms: the CUSUM of the scores, or the score itself, for a detector
-that accumulates by itself."""
+that accumulates by itself, and for a recorded ``"column"``, which faults of sensors do not join. A
+``"flag"`` is an alarm already: it has a threshold of its own, which promises nothing."""
 
-STATISTICS: Final[tuple[AlarmKind, ...]] = get_args(AlarmKind)
+STATISTICS: Final[tuple[AlarmKind, ...]] = ("cusum", "score")
+RECORDED: Final[tuple[AlarmKind, ...]] = ("column", "flag")
+FLAGGED: Final = 0.5
+"""Threshold of a flag, which is 0 or 1."""
 
 _ROUNDING: Final = 1e-9  # share of an episode that levels may be off: (n + 1) x 0.05 is whole
 
@@ -265,6 +269,8 @@ class Calibration:
         -------
         float
         """
+        if self.kind == "flag":
+            return FLAGGED
         # Where recordings are too few for the level, their windows count, and nothing is promised.
         unit = np.arange(len(self.largest))
         if not self.no_promise(level, confidence):
@@ -444,7 +450,7 @@ def too_few(
         least_episodes(level, statistic, confidence) for statistic in STATISTICS
     )
     return (
-        f"{subject} takes {least_score if kind == 'score' else least_cusum} calibration episodes, "
+        f"{subject} takes {least_cusum if kind == 'cusum' else least_score} calibration episodes, "
         f"got {episodes}: {least_cusum} for a CUSUM of the scores, which half of them standardize, "
         f"{least_score} for the detector's own score as the "
         "statistic; "
@@ -554,7 +560,7 @@ def least_episodes(level: float, kind: AlarmKind, confidence: float | None = Non
         n = math.ceil(1 / level - _ROUNDING) - 1
     else:
         n = math.ceil(math.log(1 - confidence) / math.log(1 - level) - _ROUNDING)
-    return n if kind == "score" else 2 * n
+    return 2 * n if kind == "cusum" else n
 
 
 def offered_levels(episodes: int, kind: AlarmKind) -> dict[str, float]:
@@ -579,7 +585,9 @@ def offered_levels(episodes: int, kind: AlarmKind) -> dict[str, float]:
     >>> list(offered_levels(18, "cusum")), list(offered_levels(19, "score"))
     (['at_10pct'], ['at_10pct', 'at_5pct'])
     """
-    n = episodes if kind == "score" else episodes // 2
+    if kind == "flag":
+        return dict(LEVELS)
+    n = episodes // 2 if kind == "cusum" else episodes
     return {suffix: level for suffix, level in LEVELS.items() if quantile_rank(n, level) <= n}
 
 

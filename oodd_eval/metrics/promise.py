@@ -322,7 +322,7 @@ own score
 
 
 def _name(kind: AlarmKind) -> str:
-    return "a detector's own score" if kind == "score" else "a CUSUM of the scores"
+    return "a CUSUM of the scores" if kind == "cusum" else "a detector's own score"
 
 
 def achieved_share(

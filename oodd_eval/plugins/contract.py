@@ -68,10 +68,10 @@ Copied = TypeVar("Copied")
 Progress: TypeAlias = Callable[[float], object]
 """A function that a long fit may call with the share of it that is done, from 0 to 1."""
 
-Alarm = Literal["cusum", "score"]
+Alarm = Literal["cusum", "score", "column", "flag"]
 """Statistic of a detector's guaranteed alarms, see `oodd_eval.metrics.alarms.GuaranteedAlarm`."""
 
-Training = Literal["nominal", "simulation", "anomalies", "external", "oracle"]
+Training = Literal["nominal", "simulation", "anomalies", "failures", "external", "oracle"]
 """The knowledge that a detector declares, see `DetectorSpec`."""
 
 
@@ -98,6 +98,8 @@ class Detector(Protocol):
       at once, where batching is faster;
     - ``fit(nominal, progress=None)``: `progress` is then a function, or None, which a long fit
       calls now and then with the share that is done, from 0 to 1; it decides nothing;
+    - ``fit(nominal, failures=None)``, for one that declares ``training="failures"``: `failures` are
+      then failed episodes, a sequence of Trajectory; None where it is fitted without;
     - ``warm_up``: an int of at most 20, rows at the start that it leaves NaN beyond the horizon;
     - ``reset()`` and ``update(observation, action=None) -> float``: see `StreamingDetector`;
     - ``state()`` and ``restore(state)``: see `StorableDetector`;
@@ -247,11 +249,17 @@ class DetectorSpec:
     training
         What it learns from beyond parameters: ``"nominal"``, the trajectories given to `fit`, and
         nothing else; ``"simulation"``, nominal episodes of its own besides; ``"anomalies"``,
-        anomalous ones; ``"external"``, other data, such as pretrained weights; ``"oracle"``, it has
+        anomalous ones; ``"failures"``, failed episodes of training tasks, which `fit` is handed;
+        ``"external"``, other data, such as pretrained weights; ``"oracle"``, it has
         the true equations of the environment. Boards rank the first.
     alarm
         The statistic of the guaranteed alarms: ``"cusum"`` of standardized scores, or ``"score"``,
-        the score itself, for a detector that accumulates by itself.
+        the score itself, for a detector that accumulates by itself. Of a monitor's recorded number,
+        which faults of the sensors do not join: ``"column"``, the number itself, and ``"flag"``, an
+        alarm already, where the number is not 0, whatever the level.
+    columns
+        Names of columns of logs, sensors or recorded scores, that it is handed in place of the
+        sensors; a name stands for NAME[0], NAME[1] and so on, too. Empty for the sensors.
     adapts
         ``"baseline"`` for a detector that learns from the first rows of each episode by itself,
         where these are declared nominal. Its factory is then called with their number, too, as
@@ -291,6 +299,7 @@ class DetectorSpec:
     deterministic: bool = False
     training: Training = "nominal"
     alarm: Alarm = "cusum"
+    columns: tuple[str, ...] = ()
     adapts: Literal["", "baseline"] = ""
     roles: bool = False
     parameters: type | None = None
@@ -397,15 +406,20 @@ def takes_progress(detector: Detector) -> bool:
 
 
 def fit_detector(
-    detector: Detector, nominal: Sequence[Trajectory], progress: Progress | None = None
+    detector: Detector,
+    nominal: Sequence[Trajectory],
+    progress: Progress | None = None,
+    failures: Sequence[Trajectory] | None = None,
 ) -> None:
     """Fit a detector; if it can tell, `progress` hears now and then which share is done.
 
-    Shares are heard in this process and during the fit only. `ContractError`: the detector calls
-    what it is handed with something else than a share.
+    Failed episodes are handed to one that declares that it learns from them. Shares are heard in
+    this process and during the fit only. `ContractError`: the detector calls what it is handed with
+    something else than a share.
     """
+    further = {} if failures is None else {"failures": failures}
     if progress is None or not takes_progress(detector):
-        detector.fit(nominal)
+        detector.fit(nominal, **further)
         return
     latest, lock = -math.inf, threading.Lock()
 
@@ -418,7 +432,7 @@ def fit_detector(
                 latest = now
                 progress(float(share))
 
-    detector.fit(nominal, progress=report)  # type: ignore[call-arg]
+    detector.fit(nominal, progress=report, **further)  # type: ignore[call-arg]
     with lock:
         latest = math.inf  # A detector may keep the function, and call it later.
 

@@ -7,8 +7,10 @@ and silently drops the second of two that share a name.)
 
 from __future__ import annotations
 
+import fnmatch
 import inspect
 import os
+import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -269,9 +271,13 @@ class Plugins:
         values.pop(ACTIONS, None)
         return self.offer(name), values
 
-    def select(self, patterns: str) -> list[str]:
-        """Return the names of the detectors that a comma list of names and globs selects."""
-        parts = [part.strip() for part in patterns.split(",")]
+    def select(self, patterns: str, columns: Collection[str] = ()) -> list[str]:
+        """Return the names of the detectors that a comma list of names and globs selects.
+
+        A glob behind a colon, such as ``column:*_innov``, stands for all `columns` that it matches.
+        """
+        listed = (part.strip() for part in patterns.split(","))
+        parts = [name for part in listed for name in _of_columns(part, columns)]
         several = [p for p in parts if p == "all" or (":" not in p and set(p) & set("*?["))]
         exact = {p: self.offer(p).spec.name for p in parts if p and p not in several}
         offers = self.offers if several else self._offers
@@ -378,6 +384,16 @@ class Plugins:
         version = "+".join(filter(None, (named(point.dist)[1], spec.version)))
         distribution = distribution_of(point)
         return Offer(spec, point.name, point.module, distribution, version, self._packages)
+
+
+def _of_columns(text: str, columns: Collection[str]) -> list[str]:
+    """Return what a name with a glob behind a colon stands for; itself for any other name."""
+    match = re.fullmatch(r"([a-z]+:(?:-|\||abs\()?)([^|)]*[*?][^|)]*)([|)]?)", text)
+    if not match:
+        return [text]
+    names = fnmatch.filter(columns, match[2])
+    check_known(f"column for {text!r}", columns, *(names or [match[2]]))
+    return [match[1] + name + match[3] for name in names]
 
 
 def discover(

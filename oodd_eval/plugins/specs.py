@@ -36,7 +36,8 @@ def plain_spec(spec: object) -> DetectorSpec:
     check_detector_spec(spec)
     of_class = spec.parameters
     declared = None if of_class is None else declared_as(parameters_of(of_class))
-    return replace(spec, requires=tuple(spec.requires), parameters=declared)
+    requires, columns = tuple(spec.requires), tuple(spec.columns)
+    return replace(spec, requires=requires, columns=columns, parameters=declared)
 
 
 def declared_as(infos: Mapping[str, ParameterInfo]) -> type:
@@ -151,7 +152,7 @@ FIELDS: Final[tuple[tuple[str, str, Callable[[Any], bool]], ...]] = (
     ("alarm", " or ".join(get_args(Alarm)), _one_of(*get_args(Alarm))),
     ("adapts", "'' or baseline", _one_of("", "baseline")),
     ("deterministic other_parameters horizon_decides_fit roles", "True or False", _is_truth),
-    ("requires", "names of modules", _are_lines),
+    ("requires columns", "names, of modules or columns", _are_lines),
     ("seconds", "a number, 0 or more", lambda n: type(n) in (int, float) and 0 <= n < math.inf),
     ("version", "a version such as 1.2", _text("[A-Za-z0-9.+!_-]{0,64}")),
     ("parameters", "a dataclass with fields of ASCII names, or None", _declares),

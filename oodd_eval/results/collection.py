@@ -375,7 +375,7 @@ class Results(Sequence[Record]):
                 file = stored_scores([record], self._directory, data)
                 of_board = [r for r in self.records if Conditions.of(r) == Conditions.of(record)]
                 joining = file.parts[TWINS] if record.rolling else None
-                file = with_stream(file, data, [record.condition], record.limit)
+                file = with_stream(file, data, [record.condition], record.limit, record.alarm)
                 calibration, numbers = file.parts[CALIBRATION], record.recordings
                 rules = Rules.fit(calibration, record.alarm, joining, numbers, file.stream)
                 yield _scored(record, file, data, rules, level_of(of_board))

@@ -190,9 +190,18 @@ def largest_of(stream: Mapping[str, Sequence[Scores]]) -> list[float] | None:
 
 
 def with_stream(
-    scores: ScoreFile, data: EnvironmentData, conditions: Sequence[Condition], limit: int | None
+    scores: ScoreFile,
+    data: EnvironmentData,
+    conditions: Sequence[Condition],
+    limit: int | None,
+    alarm: AlarmKind,
 ) -> ScoreFile:
-    """Return scores of a unit with the surprise of the stream, which counts without twins."""
+    """Return scores of a unit with the surprise of the stream, which counts without twins.
+
+    A monitor's recorded number is judged as it is.
+    """
+    if alarm in alarms.RECORDED:
+        return replace(scores, stream={})
     if data.paired or len(scores.stream) == len(scores.parts):
         return scores
     return replace(scores, stream=stream_of(data, conditions, limit))
@@ -307,7 +316,8 @@ def evaluated(
     before they differ, see `check_before_effect`.
     """
     if not records[0].paired:
-        scores = with_stream(scores, data, [r.condition for r in records], records[0].limit)
+        conditions, first = [r.condition for r in records], records[0]
+        scores = with_stream(scores, data, conditions, first.limit, first.alarm)
     try:
         joining = scores.parts[TWINS] if records[0].rolling else None
         records = [replace(r, recordings=_recordings(r, scores.parts, data)) for r in records]
@@ -318,7 +328,7 @@ def evaluated(
         return _invalid(
             records, "scores are too large: their sum over the calibration trajectories overflows"
         )
-    if records[0].alarm == "score" and math.isnan(rules.paper.standardization.mean):
+    if records[0].alarm != "cusum" and math.isnan(rules.paper.standardization.mean):
         # Any score would be an alarm.
         return _invalid(
             records, "no score of the calibration trajectories is defined, so there is no threshold"
@@ -502,8 +512,8 @@ def _calibration_draws(
     data: EnvironmentData,
 ) -> list[Draws]:
     """Return what calibration does to the alarms of each cell of a unit."""
-    # A rolling calibration is not resampled: its episodes have an order.
-    if first.rolling:
+    # A rolling calibration is not resampled: its episodes have an order. A flag needs none.
+    if first.rolling or first.alarm == "flag":
         return [{} for _ in cells]
     calibration, numbers = scores.parts[CALIBRATION], first.recordings.get(CALIBRATION)
     largest = largest_of(scores.stream)

@@ -17,11 +17,12 @@ from typing import Any, Final, Literal
 
 from oodd_eval.data import layout
 from oodd_eval.data.condition import Condition
-from oodd_eval.data.facts import PROTOCOL, Group
+from oodd_eval.data.facts import PROTOCOL, Group, Quantity
+from oodd_eval.data.parts import FAILURES, columns_named
 from oodd_eval.data.split import Split
-from oodd_eval.errors import UsageError
+from oodd_eval.errors import UnknownNameError, UsageError
 from oodd_eval.names import Predicate, listed
-from oodd_eval.plugins.contract import CONTRACT, Alarm, Training
+from oodd_eval.plugins.contract import CONTRACT, Alarm, DetectorSpec, Training
 from oodd_eval.plugins.discovery import Offer, Plugins
 from oodd_eval.plugins.parameters import parameters_by_detector, parameters_of, resolve_parameters
 from oodd_eval.results.identity import Cell, Setting
@@ -38,7 +39,8 @@ class Unit:
     `parameters` are all that the factory gets, sorted by name; `recorded` are those that are part
     of the result, so not the device. `plugin` is empty for a factory of this process, which has no
     `source` (the digest of a plug-in's code) and no key of a stored fit; its scores are stored
-    under a key, but never taken from there by a later run. `roles` are those of the sensors for a
+    under a key, but never taken from there by a later run. `columns` are shown to the detector in
+    place of the sensors, if any. `roles` are those of the sensors for a
     detector that declares them.
     """
 
@@ -54,6 +56,7 @@ class Unit:
     source: str = ""
     inputs: str = ""
     alarm: Alarm = "cusum"
+    columns: tuple[str, ...] = ()
     adapts: Literal["", "baseline"] = ""
     roles: tuple[str, ...] = ()
     deterministic: bool = False
@@ -161,12 +164,16 @@ def make_plan(
     if device is not None:
         _set_device(device, offers, values)
     units: list[Unit] = []
+    lacking: dict[str, list[str]] = {}  # reasons by detector
     taking: dict[tuple[str, str], list[str]] = {}  # environments by detector and its replacement
     for environment in environments:
         if not (conditions := _chosen(split.conditions(environment), anomalies)):
             continue
         actions = split.manifest["environments"][environment]["actions"]
         for offer, params in zip(offers, values, strict=True):
+            if reason := _lacking(offer.spec, split, environment):
+                lacking.setdefault(offer.spec.name, []).append(reason)
+                continue
             row = plugins.taking_actions(offer, params, detectors) if actions else (offer, params)
             if row[0] is not offer:
                 taking.setdefault((offer.spec.name, row[0].spec.name), []).append(environment)
@@ -175,13 +182,33 @@ def make_plan(
                 for horizon in horizons
                 for seed in seeds
             ]
+    for name, reasons in lacking.items():
+        if not any(u.setting.detector == name for u in units):
+            raise UsageError(f"{name}: {reasons[0]}")
     strengths = {environment: split.strengths(environment) for environment in environments}
     notes = tuple(
         f"{name} takes the actions of {listed(among)}: row {row}; --param {name}.actions=no leaves "
         "them out"
         for (name, row), among in taking.items()
     )
+    notes += tuple(f"{name} is left out: {r}" for name, rs in lacking.items() for r in rs)
     return Plan(split.name, split.digest, tuple(units), split.groups, limit, strengths, notes)
+
+
+def _lacking(spec: DetectorSpec, split: Split, environment: str) -> str:
+    """Return what a detector needs that an environment has not; empty if nothing."""
+    entry = split.manifest["environments"][environment]
+    if spec.training == "failures" and FAILURES not in entry["groups"]:
+        return (
+            f"{environment} has no failed episodes to learn from: import logs with an outcome and "
+            "with failures = 0.5, the share of the failed episodes for training"
+        )
+    try:
+        for name in spec.columns:
+            columns_named([*map(Quantity.read, entry["sensors"])], name, environment)
+    except UnknownNameError as error:
+        return str(error)
+    return ""
 
 
 def _check_rolling(split: Split, environments: Sequence[str]) -> None:
@@ -274,8 +301,8 @@ def make_unit(
     roles = split.roles(environment) if spec.roles else ()
     if roles:
         identity["roles"] = roles
-    # Some file systems take no colons, and some do not tell capitals.
-    name = spec.name.lower().replace(":", "-")
+    # Some file systems take no colons or brackets, and some do not tell capitals.
+    name = re.sub(r"[^a-z0-9.]+", "-", spec.name.lower())
     scores = f"{name}-{environment}-{_digest(identity | {'protocol': PROTOCOL})[:20]}"
     fit = ""
     if offer.plugin:
@@ -290,6 +317,8 @@ def make_unit(
             same["horizon"] = None
         if rows := split.baseline(environment):
             same["baseline"] = rows
+        if spec.training == "failures":
+            same["failures"] = split.train_digest(environment, FAILURES)
         # It tells nothing of the environment, since the worker sees it.
         fit = _digest(identity | same)[:32]
     return Unit(
@@ -305,6 +334,7 @@ def make_unit(
         source=source,
         inputs=spec.inputs,
         alarm=spec.alarm,
+        columns=spec.columns,
         adapts=spec.adapts,
         roles=roles,
         deterministic=spec.deterministic,

@@ -149,7 +149,7 @@ def _as_they_finish(
         if results:
             if scored.status == "ok" and not scored.resumed:
                 conditions, limit = job.unit.conditions, job.plan.limit
-                scored.file = with_stream(scored.file, job.data, conditions, limit)
+                scored.file = with_stream(scored.file, job.data, conditions, limit, job.unit.alarm)
                 results.write_scores(job.unit.scores_key, scored.file)
             if scored.log:
                 write_text(results.log_path(job.unit.scores_key), scored.log)

@@ -147,7 +147,9 @@ class GroupedScoring:
 
     def __init__(self, job: UnitJob, progress: Progress = ignore_progress) -> None:
         self._progress = progress
-        self._job, self._sets = job, parts_of(job.data, job.unit.conditions)
+        columns = job.unit.columns
+        data = job.data.of_columns(columns) if columns else job.data
+        self._job, self._data, self._sets = job, data, parts_of(data, job.unit.conditions)
         self._lengths = lengths_of(self._sets, job.plan.limit)
         self._adapts = bool(job.unit.adapts)
         # Rows at the start of each episode that a detector is not shown, or learns from.
@@ -157,9 +159,12 @@ class GroupedScoring:
             for part, lengths in self._lengths.items():
                 check_baseline(lengths, rows, f"{job.unit.environment}/{part}")
         if rows and not self._adapts:
-            self._baseline = Baseline.fit(islice(job.data.train, job.plan.limit), rows)
+            self._baseline = Baseline.fit(islice(data.train, job.plan.limit), rows)
             self._lengths = {p: [n - rows for n in ns] for p, ns in self._lengths.items()}
-        self._train = _Visible(job.data.train, job.plan.limit, self._visible)
+        self._train = _Visible(data.train, job.plan.limit, self._visible)
+        self._failures = None
+        if job.unit.training == "failures" and data.failures is not None:
+            self._failures = _Visible(data.failures, job.plan.limit, self._visible)
         sizes = {part: len(lengths) for part, lengths in self._lengths.items()}
         self._groups = mixed(sizes) if job.streamed else groups(sizes)
         # Metrics with twins alone are of explanations, and there are no baseline rows then.
@@ -194,6 +199,7 @@ class GroupedScoring:
             () if self._job.streamed else self._heard,
             limits=limits,
             stop=stop,
+            failures=self._failures,
             launcher=self._job.launcher,
             state=state,
             keep=keep,
@@ -246,7 +252,8 @@ class GroupedScoring:
             baseline=self._adapting,
             roles=unit.roles,
         )
-        contract.fit_detector(detector, [*self._train], self._progress)
+        failures = None if self._failures is None else [*self._failures]
+        contract.fit_detector(detector, [*self._train], self._progress, failures)
         self._progress(1.0)
         return detector
 
@@ -320,7 +327,7 @@ class GroupedScoring:
             (member, later, self._visible(self._sets[member.part][member.number])[:n], array)
             for (member, later, n), array in zip(self._asked, explained, strict=True)
         )
-        return with_explanations(parts, asked, self._job.data, self._train)
+        return with_explanations(parts, asked, self._data, self._train)
 
     def _checked(
         self, scores: Sequence[object], warm_up: object

@@ -12,6 +12,7 @@ from scipy.stats import binom
 from oodd_eval.cli.main import main
 from oodd_eval.data.parts import CALIBRATION
 from oodd_eval.metrics.alarms import (
+    RECORDED,
     STATISTICS,
     AlarmKind,
     Calibration,
@@ -315,7 +316,7 @@ def test_a_monitor_gives_the_statistics_and_alarms_of_a_guaranteed_alarm_bit_for
 
 
 def test_the_contract_offers_the_statistics_that_there_are():
-    assert get_args(Alarm) == get_args(AlarmKind) == STATISTICS
+    assert get_args(Alarm) == get_args(AlarmKind) == (*STATISTICS, *RECORDED)
 
 
 def test_show_computes_figures_with_another_statistic_and_stores_none(tmp_path, tiny_split, capsys):

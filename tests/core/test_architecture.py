@@ -202,7 +202,14 @@ def test_no_text_imports_what_the_contracts_forbid():
     assert not wrong(paths, lambda path: {*named_by_text(path)} & known - {module_name(path)})
 
 
-AROUND = ("oodd_checks", "oodd_interventions", "oodd_leaderboard", "oodd_live", "oodd_logs")
+AROUND = (
+    "oodd_checks",
+    "oodd_interventions",
+    "oodd_leaderboard",
+    "oodd_live",
+    "oodd_logs",
+    "oodd_monitors",
+)
 LOADS = {
     "list detectors": ((*AROUND, "oodd_eval.results", "oodd_eval.scoring"), 1_950),
     "run --detector mewma --env hopper -q": (AROUND, 10_700),

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
-from itertools import islice
+from itertools import chain, islice
 from typing import Any, Final, TypeAlias
 
 import numpy as np
@@ -75,6 +75,7 @@ def run_isolated(
     *,
     limits: Limits,
     stop: Stop,
+    failures: Sequence[Trajectory] | None = None,
     launcher: Launcher | None = None,
     state: PackedState | None = None,
     keep: bool = False,
@@ -82,6 +83,8 @@ def run_isolated(
     progress: Progress = ignore_progress,
 ) -> Outcome:
     """Fit on `train` and score groups of trajectories, each group in a process of its own.
+
+    A detector that learns from failed episodes is handed `failures`, too.
 
     A group's process is a fork of the fitted one. Where there can be none, as threads run on after
     the fit or a launcher starts each process, it is a fresh one, which takes over the state of the
@@ -101,7 +104,8 @@ def run_isolated(
     worker is killed and the status is ``"error"``. Only errors of reading the trajectories are
     raised.
     """
-    unit = _UnitRun(request, train, limits, stop, launcher, state, keep, streamed, progress)
+    settings = limits, stop, launcher, state, keep, streamed, progress
+    unit = _UnitRun(request, train, failures, *settings)
     try:
         unit.run(groups, explained, heard)
     except GivenUpError as error:
@@ -115,6 +119,7 @@ class _UnitRun:
 
     request: Mapping[str, Any]
     train: Sequence[Trajectory]
+    failures: Sequence[Trajectory] | None
     limits: Limits
     stop: Stop
     launcher: Launcher | None
@@ -194,13 +199,14 @@ class _UnitRun:
         """Have a process fit, or take over the state; return whether groups can be forks of it."""
         state, channel, outcome = self.state, child.channel, self.outcome
         with suppress(ConnectionError):  # It has ended; what it said tells why.
-            train = () if state else self.train
+            failed = None if self.failures is None else len(self.failures)
+            train = () if state else (self.train, self.failures or ())
             wants = state is None and outcome.seconds_fit is None and (self.keep or not forks)
-            order = {"train": len(train), "restore": state is not None}
+            order = {"train": len(self.train), "failures": failed, "restore": state is not None}
             channel.send({**self.request, **order, "forks": forks, "state": wants})
             if state:
                 channel.send_state(state)
-            for trajectory in train:
+            for trajectory in chain.from_iterable(train):
                 channel.send_trajectory(trajectory)
         message, latest = _receive(channel), -math.inf
         while "progress" in message:

@@ -137,9 +137,12 @@ def serve(channel: Channel, packages: Sequence[Path] = ()) -> None:
             raise ContractError("the detector has state but no restore")
         detector.restore(channel.receive_state().state())
     else:
-        train = TrajectoryFile(channel.receive_trajectory() for _ in range(request["train"]))
+        train, failures = (
+            None if n is None else TrajectoryFile(channel.receive_trajectory() for _ in range(n))
+            for n in (request["train"], request["failures"])
+        )
         start = time.perf_counter()
-        fit_detector(detector, train, lambda share: _tell(channel, pid, share))
+        fit_detector(detector, train or (), lambda share: _tell(channel, pid, share), failures)
     if os.getpid() != pid:
         os._exit(1)  # The fit has forked, and one process answers.
     seconds = time.perf_counter() - start
