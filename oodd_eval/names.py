@@ -15,7 +15,10 @@ Value = TypeVar("Value")
 Read = TypeVar("Read")
 
 DETECTOR_NAME: Final = r"[a-z0-9][a-z0-9-]{0,63}"
-SPEC_NAME: Final = DETECTOR_NAME + r"(:[-\w][-+\w ./%()\[\]]{0,127})?"
+COLUMN_NAME: Final = r"[-\w/][-+\w ./%()\[\]]{0,119}"
+"""What a column of logs is called where it is named as a detector, without its sign."""
+
+SPEC_NAME: Final = DETECTOR_NAME + r"(:[-\w/][-+\w ./%()\[\]]{0,127})?"
 """A detector's name, perhaps with a class or column behind a colon: it goes into tables."""
 
 PARAMETER_NAME: Final = r"[A-Za-z_]\w{0,63}"
@@ -67,7 +70,9 @@ def select(kind: str, patterns: str, known: Iterable[str]) -> list[str]:
     for pattern in (p.strip() for p in patterns.split(",")):
         if not pattern:
             continue
-        matches = names if pattern == "all" else fnmatch.filter(names, pattern)
+        # In a glob the brackets of a name such as "column:pos_innov[0]" are a set of letters.
+        exact = [pattern] if pattern in names else fnmatch.filter(names, pattern)
+        matches = names if pattern == "all" else exact
         if not matches:
             raise UnknownNameError(kind, pattern, names)
         selected.update(dict.fromkeys(matches))
