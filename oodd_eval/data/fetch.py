@@ -9,11 +9,9 @@ import contextlib
 import functools
 import hashlib
 import http.client
-import io
 import shutil
 import stat
 import tarfile
-import time
 import urllib.error
 import urllib.request
 import zipfile
@@ -33,9 +31,6 @@ from oodd_eval.errors import DigestError, OutputError, SplitError, SplitNotFound
 ARCHIVES: Final = (".tar", ".tar.gz", ".tgz", ".tar.xz", ".tar.bz2", ".zip")
 ARCHIVE_BYTES: Final = 10**12
 MOST_MEMBERS: Final = 10_000  # of an archive: a tar file of 10 MB may have millions
-PATIENCE: Final = 60.0
-SLOWEST: Final = 4096
-"""Seconds in which a download may be slow, and the bytes a second that it must have later."""
 _MIB: Final = 2**20
 
 Progress = Callable[[str], None]
@@ -322,41 +317,6 @@ class _Redirects(urllib.request.HTTPRedirectHandler):
         return super().redirect_request(req, fp, code, msg, headers, newurl)
 
 
-class _Watched(io.RawIOBase):
-    """A server's answer as a raw stream; `TimeoutError` when it stays slower than `SLOWEST`."""
-
-    def __init__(self, raw: Any) -> None:
-        self._raw, self._since, self._bytes = raw, time.monotonic(), 0
-
-    def readable(self) -> bool:
-        return True
-
-    def readinto(self, buffer: Any) -> int | None:
-        got: int | None = self._raw.readinto(buffer)
-        self._bytes += got or 0
-        late = time.monotonic() - self._since - PATIENCE
-        if late > 0 and self._bytes < late * SLOWEST:
-            raise TimeoutError(f"it gives less than {SLOWEST} bytes a second")
-        return got
-
-    def close(self) -> None:
-        self._raw.close()
-        super().close()
-
-
-class _Response(http.client.HTTPResponse):
-    def __init__(self, sock: Any, *arguments: Any, **settings: Any) -> None:
-        super().__init__(sock, *arguments, **settings)
-        self.fp.close()
-        self.fp = io.BufferedReader(_Watched(sock.makefile("rb", buffering=0)))
-
-
-class _Watching(urllib.request.HTTPHandler, urllib.request.HTTPSHandler):
-    def do_open(self, http_class: Any, req: Any, **settings: Any) -> Any:
-        watched: Any = type("Watched", (http_class,), {"response_class": _Response})
-        return super().do_open(watched, req, **settings)
-
-
 def _plain(text: object) -> str:
     """Return a stranger's text without what steers a terminal."""
     return "".join(c if c.isprintable() else "?" for c in str(text))[:300]
@@ -370,8 +330,8 @@ def _download(address: str, target: Path, most: int) -> None:
     headers |= {"Range": f"bytes={have}-"} if have else {}
     request = urllib.request.Request(address, headers=headers)  # noqa: S310  http or https
     try:
-        # Handlers given here take the place of those that follow a redirect to any scheme.
-        opener = urllib.request.build_opener(_Redirects, _Watching)
+        # It takes the place of the one that follows a redirect to any scheme.
+        opener = urllib.request.build_opener(_Redirects)
         response = opener.open(request, timeout=60)
     except urllib.error.HTTPError as error:
         error.close()

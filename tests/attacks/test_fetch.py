@@ -5,7 +5,6 @@ import io
 import shutil
 import tarfile
 import threading
-import time
 import zipfile
 
 import pytest
@@ -90,25 +89,6 @@ def test_a_redirect_from_https_to_http_is_refused():
     request = fetching.urllib.request.Request("https://example.org/x")
     with pytest.raises(SplitError, match=r"leads to http://.*expected https: refused"):
         fetching._Redirects().redirect_request(request, None, 302, "x", {}, "http://h/x")
-
-
-@pytest.mark.parametrize("before", [b"", b"HTTP/1.1 200 OK\r\nContent-Length: 9999\r\n\r\n"])
-def test_a_server_that_drips_is_left(serve, monkeypatch, before):
-    monkeypatch.setattr(fetching, "PATIENCE", 0.2)
-
-    def drip(write):
-        try:
-            write(before)
-            for _ in range(200):
-                write(b"1")
-                time.sleep(0.02)
-        except OSError:
-            pass
-
-    address, begun = serve(drip), time.monotonic()
-    with pytest.raises(SplitError, match="less than 4096 bytes a second"):
-        fetch(address)
-    assert time.monotonic() - begun < 3
 
 
 @pytest.mark.parametrize("error", [ZeroDivisionError, SystemExit])
