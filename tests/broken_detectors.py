@@ -91,13 +91,24 @@ class Good:
         self.reset()
 
 
+class LearnsFromFailures(Good):
+    """The same, in units of how far failed episodes spread."""
+
+    def fit(self, nominal, progress=None, failures=None):
+        super().fit(nominal, progress)
+        if failures is not None:
+            failed = np.concatenate([x.observations for x in failures]).astype(np.float64)
+            self.std_ = np.where(self.std_ == 1.0, 1.0, failed.std(axis=0) / 4)
+
+
 GOOD = DetectorSpec(
     "good",
-    Good,
+    LearnsFromFailures,
     "",
     deterministic=True,
     parameters=declared_by({"power": 1.0}),
     horizon_decides_fit=False,
+    training="failures",
     adapts="baseline",
     roles=True,
 )
@@ -118,6 +129,7 @@ BROKEN = {}
 
 def breaks(check, message, *, also=(), **changes):
     """Register a broken detector: the class below, with changes of the spec."""
+    changes = {"training": "nominal", **changes}
 
     def register(factory):
         spec = dataclasses.replace(GOOD, factory=factory, **changes)
@@ -520,6 +532,18 @@ class HandsOverInVain(Good):
 class LearnsNothingFromIt(Good):
     def __init__(self, *, seed=0, horizon=1, power=1.0, baseline=0, roles=()):
         super().__init__(seed=seed, horizon=horizon, power=power)
+
+
+@breaks(
+    "failures", "scores after a fit with other failed episodes are the same", training="failures"
+)
+class IgnoresFailures(Good):
+    def fit(self, nominal, progress=None, failures=None):
+        super().fit(nominal, progress)
+
+
+@breaks("fits", "unexpected keyword argument 'failures'", training="failures")
+class TakesNoFailures(Good): ...
 
 
 @breaks("roles", "unexpected keyword argument 'roles'")

@@ -26,7 +26,7 @@ from oodd_eval.data.split import imported_environments, split_directories
 from oodd_eval.errors import UnknownNameError, UsageError, near
 from oodd_eval.metrics.catalogue import NAMES, MetricInfo, metric_info
 from oodd_eval.names import counted
-from oodd_eval.plugins.contract import Training
+from oodd_eval.plugins.contract import Alarm, Training
 from oodd_eval.plugins.discovery import Offer
 from oodd_eval.plugins.parameters import parameters_of
 
@@ -122,10 +122,12 @@ def _imported(name: str, split: str, entry: Mapping[str, Any]) -> Lines:
             yield key, text
     for part, group in entry["groups"].items():
         yield part, counted(group["trajectories"], "episode(s)")
-    for kind in ("sensors", "actions"):
-        for i, column in enumerate(entry[kind]):
+    scores = [column for column in entry["sensors"] if column.get("role") == "score"]
+    sensors = [column for column in entry["sensors"] if column not in scores]
+    for kind, columns in (("sensor", sensors), ("score", scores), ("action", entry["actions"])):
+        for i, column in enumerate(columns):
             yield (
-                "" if i else counted(len(entry[kind]), f"{kind[:-1]}(s)"),
+                "" if i else counted(len(columns), f"{kind}(s)"),
                 f"{column['name']} ({column['unit']})",
             )
     yield "more", f"oodd-eval data info {split}"
@@ -179,8 +181,17 @@ _TRAINING: Final[Mapping[Training, str]] = {
     "nominal": "the nominal trajectories of a split",
     "simulation": "simulation: nominal episodes of its own besides (boards do not rank it)",
     "anomalies": "anomalies (boards do not rank it)",
+    "failures": "nominal and failed training episodes (boards do not rank it)",
     "external": "external data (boards do not rank it)",
     "oracle": "nominal trajectories, with the true equations (boards do not rank it)",
+}
+
+
+_ALARMS: Final[Mapping[Alarm, str]] = {
+    "cusum": "CUSUM of the score",
+    "score": "the score itself",
+    "column": "the recorded number itself",
+    "flag": "where it is 1, at every level: it promises nothing",
 }
 
 
@@ -191,10 +202,10 @@ def _detector(offer: Offer) -> Lines:
     if why := offer.unavailable():
         yield "unavailable", why
     yield "source", spec.reference or "not given"
-    yield "looks at", spec.inputs.replace("+", " and ")
+    yield "looks at", ", ".join(spec.columns) or spec.inputs.replace("+", " and ")
     if spec.with_actions:
         yield "with actions", f"{spec.with_actions} runs in its place, unless actions is no"
-    yield "alarm", "the score itself" if spec.alarm == "score" else "CUSUM of the score"
+    yield "alarm", _ALARMS[spec.alarm]
     yield "trained on", _TRAINING[spec.training]
     yield "seed", "changes nothing" if spec.deterministic else "decides random draws"
     for i, (name, parameter) in enumerate(parameters_of(spec.parameters).items()):

@@ -77,11 +77,8 @@ def _imported() -> Rows:
     from oodd_eval.data.split import imported_environments
 
     for name, split, entry in imported_environments():
-        yield (
-            name,
-            f"split {split}",
-            f"{counted(len(entry['sensors']), 'sensor(s)')}, imported from logs",
-        )
+        sensors = [column for column in entry["sensors"] if column.get("role") != "score"]
+        yield name, f"split {split}", f"{counted(len(sensors), 'sensor(s)')}, imported from logs"
 
 
 def _detectors(plugins: Plugins) -> Rows:

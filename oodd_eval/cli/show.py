@@ -25,7 +25,7 @@ from oodd_eval.cli.reporter import TerminalReporter, summary
 from oodd_eval.data.facts import ENVIRONMENTS, in_order
 from oodd_eval.data.split import Split, load_split, split_directories
 from oodd_eval.errors import UsageError
-from oodd_eval.metrics.alarms import STATISTICS
+from oodd_eval.metrics.alarms import RECORDED, STATISTICS
 from oodd_eval.metrics.catalogue import NAMES
 from oodd_eval.names import check_known, expression, select
 from oodd_eval.prose import print_prose, print_sections
@@ -65,7 +65,8 @@ _format_options: Final = together(
 @click.option(
     "--alarm",
     type=click.Choice(STATISTICS),
-    help="watch this statistic of the scores instead of what each detector declares",
+    help="watch this statistic of the scores instead of what each detector declares; recorded "
+    "columns and flags stay as they are",
 )
 @_format_options
 @click.option("--env", default="all", type=Names("envs"), help="only these environments")
@@ -87,7 +88,9 @@ def show(options: Options) -> int:
     splits: dict[str, Split] = {}
     if not options.stored:
         if options.alarm:
-            records = [replace(record, alarm=options.alarm) for record in records]
+            records = [
+                r if r.alarm in RECORDED else replace(r, alarm=options.alarm) for r in records
+            ]
         splits = _splits(records, results, options.split)
         records = _recomputed(records, results, splits, rows=options.row_metrics)
         units = {kind: unit for split in splits.values() for kind, unit in split.units.items()}

@@ -129,7 +129,9 @@ def log_rows(data: EnvironmentData) -> Rows:
     Intervals and anomalous rows are those of episodes with intervals, of whose rows the share is.
     """
     rows = []
-    for part in (data.train, data.calibration, data.twins, *map(data.labelled, data.anomalies)):
+    failed = [data.failures] if data.failures is not None else []
+    tests = data.twins, *map(data.labelled, data.anomalies)
+    for part in (data.train, *failed, data.calibration, *tests):
         labels = ["", "", ""]
         if isinstance(part, LabelledSet):
             labelled = [(i, spans) for i, spans in enumerate(part.intervals) if spans]
@@ -164,9 +166,10 @@ def group_rows(data: EnvironmentData) -> Rows:
 
 
 def column_lines(data: EnvironmentData) -> list[str]:
-    """Return numbers, names and units of sensors and actions as lines of text."""
+    """Return numbers, names and units of sensors, recorded scores and actions as lines of text."""
     lines = []
-    kinds = {"sensors": data.sensors, "actions": data.actions}
+    scores = [column for column in data.columns if column.role == "score"]
+    kinds = {"sensors": data.sensors, "scores": scores, "actions": data.actions}
     for kind, quantities in ((kind, columns) for kind, columns in kinds.items() if columns):
         units = [f" [{quantity.unit}]" if quantity.unit != "1" else "" for quantity in quantities]
         named = [f"{i} {q.name}{u}" for i, (q, u) in enumerate(zip(quantities, units, strict=True))]

@@ -320,7 +320,8 @@ class EnvironmentData:
         ledger: Sequence[str] = (),
     ) -> None:
         self.ledger = tuple(ledger)
-        self.id, self.digest, self.discrete, self.logs = environment, digest, discrete, logs
+        self.id, self.digest, self.discrete = environment, digest, discrete
+        self.logs = self._logs = logs
         self._recordings = dict(recordings or {})
         self._file, self._stored = file, parts
         self.anomalies = tuple(map(str, conditions_in(parts)))
@@ -368,9 +369,9 @@ class EnvironmentData:
                 for name, part in self._stored.items()
                 if name != NAMES
             }
-            if self.logs and self.logs.offsets:
-                offsets = tuple(self.logs.offsets[i] for i in columns)
-                self.logs = replace(self.logs, offsets=offsets)
+            if self._logs and self._logs.offsets:
+                offsets = tuple(self._logs.offsets[i] for i in columns)
+                self.logs = replace(self._logs, offsets=offsets)
         nominal = (TrajectorySet(self._parts, part) for part in NOMINAL)
         self.train, self.calibration, self.twins = nominal
         failed = FAILURES in self._parts

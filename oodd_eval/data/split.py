@@ -311,7 +311,9 @@ class Split:
         tuple of str
             One a sensor; empty where all are just measured.
         """
-        return layout.roles_in(environment, self.manifest["environments"][environment])
+        roles = layout.roles_in(environment, self.manifest["environments"][environment])
+        of_sensors = tuple(role for role in roles if role != "score")
+        return of_sensors if {*of_sensors} - {"measured"} else ()
 
     @property
     def columns(self) -> tuple[str, ...]:

@@ -407,7 +407,7 @@ def halves(numbers: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp
 def no_promise(
     windows: int, recordings: int, level: float, kind: AlarmKind, confidence: float | None = None
 ) -> str:
-    """Say that windows of so few recordings promise nothing at a level; empty where they do.
+    """Say that windows of so few recordings, or flags, promise nothing; empty where they do.
 
     Parameters
     ----------
@@ -431,6 +431,8 @@ def no_promise(
     >>> no_promise(38, 18, 0.10, "cusum"), no_promise(17, 17, 0.10, "cusum")
     ('', '')
     """
+    if kind == "flag":
+        return "a flag is an alarm already: figures are of its own operating point, at any level"
     least = least_episodes(level, kind, confidence)
     if recordings >= min(windows, least):
         return ""

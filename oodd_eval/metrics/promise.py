@@ -322,7 +322,8 @@ own score
 
 
 def _name(kind: AlarmKind) -> str:
-    return "a CUSUM of the scores" if kind == "cusum" else "a detector's own score"
+    names = {"cusum": "a CUSUM of the scores", "column": "a recorded column"}
+    return names.get(kind, "a detector's own score")
 
 
 def achieved_share(

@@ -388,10 +388,11 @@ class Plugins:
 
 def _of_columns(text: str, columns: Collection[str]) -> list[str]:
     """Return what a name with a glob behind a colon stands for; itself for any other name."""
-    match = re.fullmatch(r"([a-z]+:(?:-|\||abs\()?)([^|)]*[*?][^|)]*)([|)]?)", text)
+    match = re.fullmatch(r"([a-z]+:-?(?:\||abs\()?)([^|)]*[*?][^|)]*)([|)]?)", text)
     if not match:
         return [text]
-    names = fnmatch.filter(columns, match[2])
+    # Columns are often called NAME[0], NAME[1]: brackets are none of a glob.
+    names = fnmatch.filter(columns, match[2].replace("[", "[[]"))
     check_known(f"column for {text!r}", columns, *(names or [match[2]]))
     return [match[1] + name + match[3] for name in names]
 

@@ -99,7 +99,8 @@ class Setting:
         >>> Setting.parse("riqn[h=5,updates=2400]") == Setting.of("riqn", 5, {"updates": 2400})
         True
         """
-        match = re.fullmatch(r"([^\[]+)(?:\[(.*)\])?", text)
+        # Behind a colon a name may have brackets of its own: column:innov[0][h=5].
+        match = re.fullmatch(r"([^\[:]+|[^\[:]+:.+?)(?:\[(\w+=.*|)\])?", text)
         settings = _read_settings(match[2] or "") if match else None
         if match is None or settings is None:
             raise UsageError(f"{text!r} is no setting: expected DETECTOR[h=N,NAME=VALUE,...]")

@@ -28,8 +28,8 @@ def doubts_before(plan: Plan, split: Split) -> Iterator[tuple[str, PromiseFindin
     """
     with split.opened() as opened:
         for name in dict.fromkeys(unit.environment for unit in plan.units):
-            kinds = sorted({unit.alarm for unit in plan.units if unit.environment == name})
-            for finding in promises_of(opened(name), kinds, plan.limit):
+            kinds = {unit.alarm for unit in plan.units if unit.environment == name} - {"flag"}
+            for finding in promises_of(opened(name), sorted(kinds), plan.limit) if kinds else ():
                 if finding.doubt:
                     yield name, finding
 
@@ -52,7 +52,7 @@ def doubts_after(
     with split.opened() as opened:
         for unit in plan.units:
             data = opened(unit.environment)
-            if not in_recorded_order(data):
+            if unit.alarm == "flag" or not in_recorded_order(data):
                 continue
             lengths = lengths_of({CALIBRATION: data.calibration}, plan.limit)
             scores = results.scores(unit.scores_key, lengths)

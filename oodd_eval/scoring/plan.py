@@ -21,6 +21,7 @@ from oodd_eval.data.facts import PROTOCOL, Group, Quantity
 from oodd_eval.data.parts import FAILURES, columns_named
 from oodd_eval.data.split import Split
 from oodd_eval.errors import UnknownNameError, UsageError
+from oodd_eval.metrics.alarms import RECORDED
 from oodd_eval.names import Predicate, listed
 from oodd_eval.plugins.contract import CONTRACT, Alarm, DetectorSpec, Training
 from oodd_eval.plugins.discovery import Offer, Plugins
@@ -183,7 +184,8 @@ def make_plan(
                 for seed in seeds
             ]
     for name, reasons in lacking.items():
-        if not any(u.setting.detector == name for u in units):
+        # What a glob or "all" has selected is left out with a note.
+        if (":" in name or not units) and not any(u.setting.detector == name for u in units):
             raise UsageError(f"{name}: {reasons[0]}")
     strengths = {environment: split.strengths(environment) for environment in environments}
     notes = tuple(
@@ -203,11 +205,17 @@ def _lacking(spec: DetectorSpec, split: Split, environment: str) -> str:
             f"{environment} has no failed episodes to learn from: import logs with an outcome and "
             "with failures = 0.5, the share of the failed episodes for training"
         )
+    columns, facts = [*map(Quantity.read, entry["sensors"])], layout.log_facts(entry)
     try:
-        for name in spec.columns:
-            columns_named([*map(Quantity.read, entry["sensors"])], name, environment)
+        numbers = [i for name in spec.columns for i in columns_named(columns, name, environment)]
     except UnknownNameError as error:
         return str(error)
+    shifted = [columns[i].name for i in numbers if facts and facts.offsets and facts.offsets[i]]
+    if shifted and spec.alarm in RECORDED:
+        return (
+            f"{shifted[0]} of {environment} is stored less its mean, as float32 cannot tell its "
+            "spread: import the logs with this column among scores, which are stored as they are"
+        )
     return ""
 
 
@@ -301,8 +309,8 @@ def make_unit(
     roles = split.roles(environment) if spec.roles else ()
     if roles:
         identity["roles"] = roles
-    # Some file systems take no colons or brackets, and some do not tell capitals.
-    name = re.sub(r"[^a-z0-9.]+", "-", spec.name.lower())
+    # Some file systems take no colons or brackets, some no long names, and some tell no capitals.
+    name = re.sub(r"[^a-z0-9_.]+", "-", spec.name.lower())[:100].rstrip("-")
     scores = f"{name}-{environment}-{_digest(identity | {'protocol': PROTOCOL})[:20]}"
     fit = ""
     if offer.plugin:
@@ -317,6 +325,8 @@ def make_unit(
             same["horizon"] = None
         if rows := split.baseline(environment):
             same["baseline"] = rows
+        if spec.columns:
+            same["columns"] = spec.columns
         if spec.training == "failures":
             same["failures"] = split.train_digest(environment, FAILURES)
         # It tells nothing of the environment, since the worker sees it.

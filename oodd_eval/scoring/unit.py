@@ -149,7 +149,7 @@ class GroupedScoring:
         self._progress = progress
         columns = job.unit.columns
         data = job.data.of_columns(columns) if columns else job.data
-        self._job, self._data, self._sets = job, data, parts_of(data, job.unit.conditions)
+        self._job, self._sets = job, parts_of(data, job.unit.conditions)
         self._lengths = lengths_of(self._sets, job.plan.limit)
         self._adapts = bool(job.unit.adapts)
         # Rows at the start of each episode that a detector is not shown, or learns from.
@@ -167,8 +167,9 @@ class GroupedScoring:
             self._failures = _Visible(data.failures, job.plan.limit, self._visible)
         sizes = {part: len(lengths) for part, lengths in self._lengths.items()}
         self._groups = mixed(sizes) if job.streamed else groups(sizes)
-        # Metrics with twins alone are of explanations, and there are no baseline rows then.
-        self._explains = job.data.paired and not rows and not job.streamed
+        # Metrics with twins alone are of explanations, and there are no baseline rows then. The
+        # parts at fault are sensors.
+        self._explains = data.paired and not (rows or columns or job.streamed)
         # Of what is explained: the episode, which of the rows after its alarm, and rows until then.
         self._asked: list[tuple[Member, int, int]] = []
         # What voices are compared on, and how.
@@ -327,7 +328,7 @@ class GroupedScoring:
             (member, later, self._visible(self._sets[member.part][member.number])[:n], array)
             for (member, later, n), array in zip(self._asked, explained, strict=True)
         )
-        return with_explanations(parts, asked, self._data, self._train)
+        return with_explanations(parts, asked, self._job.data, self._train)
 
     def _checked(
         self, scores: Sequence[object], warm_up: object

@@ -80,6 +80,7 @@ class Trial:
             else DetectorSpec("", factory_of(factory), "", inputs="observations+actions")
         )
         self.actions = self.spec.inputs == "observations+actions"
+        self.sensors = len(self.spec.columns) or SENSORS
         self.horizon, self.seed, self.parameters = horizon, seed, dict(parameters or {})
         self.arguments = self._accepted(seed=seed, horizon=horizon) | self.parameters
         self.rows = ROWS + horizon  # of an ordinary episode
@@ -121,8 +122,15 @@ class Trial:
         detector = self.make(**changes)
         with doing("fit"):
             # The harness hands over a sequence that is not a list, as here.
-            detector.fit(tuple(self.training()) if nominal is None else nominal)
+            self.learn(detector, tuple(self.training()) if nominal is None else nominal)
         return detector
+
+    def learn(self, detector: Any, nominal: Sequence[Trajectory], **further: Any) -> None:
+        """Fit a detector, with failed episodes if it declares that it learns from them."""
+        if self.spec.training == "failures":
+            failed = self.failed(nominal[0].observation_dim)
+            further = {"failures": tuple(failed), **further}
+        detector.fit(nominal, **further)
 
     @functools.cached_property
     def first_fit(self) -> Detector | AssertionError:
@@ -169,20 +177,26 @@ class Trial:
 
         def work() -> None:
             self.make()
-            detector.fit(training)
+            self.learn(detector, training)
             for trajectory in nominal:
                 detector.score(trajectory)
 
         return watch(work)
 
-    def episode(self, key: int, rows: int | None = None, sensors: int = SENSORS) -> Trajectory:
+    def episode(self, key: int, rows: int | None = None, sensors: int = 0) -> Trajectory:
         """Return the nominal episode of a key; another number of sensors is another system."""
-        observations, actions = _system(key, self.rows if rows is None else rows, sensors)
+        rows = self.rows if rows is None else rows
+        observations, actions = _system(key, rows, sensors or self.sensors)
         return Trajectory(observations, actions if self.actions else None)
 
-    def training(self, sensors: int = SENSORS, first: int = 1000) -> list[Trajectory]:
+    def training(self, sensors: int = 0, first: int = 1000) -> list[Trajectory]:
         """Return nominal episodes of equal length to fit on."""
         return [self.episode(first + i, sensors=sensors) for i in range(EPISODES)]
+
+    def failed(self, sensors: int = 0, first: int = 7000) -> list[Trajectory]:
+        """Return failed episodes to fit on: their sensors get ten times noisier."""
+        episodes = self.training(sensors, first)
+        return [noisy_from(x, self.rows // 2 + i) for i, x in enumerate(episodes)]
 
     def nominal(self, n: int = 4) -> list[Trajectory]:
         """Return nominal episodes to score, of unequal lengths, not among the training ones."""

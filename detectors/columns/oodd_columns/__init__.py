@@ -3,7 +3,6 @@
 import re
 from functools import partial
 from importlib import import_module
-from typing import Any
 
 from oodd_eval import Detector, DetectorSpec, hookimpl
 from oodd_eval.errors import UsageError
@@ -54,7 +53,7 @@ def oodd_detector_from_spec(spec: str) -> DetectorSpec | None:
     )
 
 
-def _make(kind: str, sign: int, size: bool, **_: Any) -> Detector:
-    # Listing detectors needs no numpy.
+def _make(kind: str, sign: int, size: bool, *, baseline: int = 0) -> Detector:
+    del baseline  # Episodes come whole, as they were recorded. Listing detectors needs no numpy.
     column: Detector = import_module(f"{__name__}.detector").RecordedColumn(kind, sign, size)
     return column

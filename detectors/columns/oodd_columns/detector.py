@@ -67,13 +67,13 @@ class RecordedColumn:
         self.reset()
 
     def _column(self, rows: ArrayLike) -> Scores:
-        column = np.asarray(rows, np.float64)
-        if column.shape[1] != 1:
+        columns = np.asarray(rows, np.float64)
+        if columns.shape[1] != 1:
             raise TrajectoryError(
-                f"got {column.shape[1]} columns, expected 1: of several columns that are called "
+                f"got {columns.shape[1]} columns, expected 1: of several columns that are called "
                 "NAME[0], NAME[1] and so on name one"
             )
+        column: Scores = columns[:, 0]
         if self.kind == "flag":
-            return (column[:, 0] != 0).astype(np.float64)
-        size: Scores = np.abs(column[:, 0]) if self._size else column[:, 0]
-        return self._sign * size
+            return np.asarray(column != 0, np.float64)
+        return self._sign * (np.abs(column) if self._size else column)
