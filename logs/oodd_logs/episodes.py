@@ -132,7 +132,7 @@ class EpisodeSource:
     Parameters
     ----------
     sensors, actions
-        Names and units of the columns.
+        Names and units of the columns; recorded scores are behind the sensors.
     discrete
         Whether actions are one-hot rows.
     rewards
@@ -181,7 +181,14 @@ class EpisodeSource:
     @property
     def summary(self) -> list[str]:
         """The ledger in short, a line each."""
-        return self.ledger.summary([sensor.name for sensor in self.sensors], self.recordings)
+        names = [quantity.name for quantity in self.sensors]
+        sensors, scores = names[: self.measured], names[self.measured :]
+        return self.ledger.summary(sensors, self.recordings, scores)
+
+    @property
+    def measured(self) -> int:
+        """Number of the sensors that are no recorded scores."""
+        return sum(quantity.role != "score" for quantity in self.sensors)
 
     def rows(self, facts: EpisodeFacts, start: int, stop: int) -> Matrix:
         """Return rows of an episode.
@@ -782,8 +789,10 @@ class _Reading:
 
     def _notes(self, source: EpisodeSource) -> list[str]:
         recipe = self.recipe
-        columns = f"{counted(len(source.sensors), 'sensor(s)')}, "
+        columns = f"{counted(source.measured, 'sensor(s)')}, "
         columns += counted(len(source.actions), "action(s)")
+        scores = len(source.sensors) - source.measured
+        columns += f", {counted(scores, 'score(s)')}" if scores else ""
         lines = [f"read {counted(self.recordings, 'recording(s)')}: {columns}"]
         for part, episodes in source.parts.items():
             rows = sum(facts.rows for facts in episodes)
@@ -842,7 +851,7 @@ def _in_order(selection: Selection, first: _First, source: str) -> Selection:
 def _say_far(source: EpisodeSource) -> None:
     """Name the rows of values that are no measurements by their size."""
     every = [facts for episodes in source.parts.values() for facts in episodes]
-    width, total = len(source.sensors), sum(facts.rows for facts in every)
+    width, total = source.measured, sum(facts.rows for facts in every)
     step = max(1, total * width // _SAMPLED)
     sampled = [rows[::step, :width].copy() for facts in every for rows in source.blocks(facts)]
     sample = np.concatenate(sampled)
@@ -864,6 +873,10 @@ def _settle_columns(source: EpisodeSource, recipe: Recipe) -> None:
     """Drop constant sensors if asked to, and find offsets of those that float32 cannot tell."""
     train = _moments(source, source.parts[TRAIN])
     is_constant = train.low == train.high
+    same = itertools.compress(source.sensors, is_constant)
+    if scores := [q.name for q in same if q.role == "score"]:  # a flag is never raised there
+        source.notes.append(f"scores that are constant in training, and kept: {', '.join(scores)}")
+    is_constant[source.measured :] = False
     names = ", ".join(q.name for q, same in zip(source.sensors, is_constant, strict=True) if same)
     is_dropped = recipe.constant == "drop"
     if names:
@@ -871,7 +884,7 @@ def _settle_columns(source: EpisodeSource, recipe: Recipe) -> None:
         source.notes.append(f"{how} in training: {names}")
     if names and is_dropped:
         kept, width = np.flatnonzero(~is_constant).tolist(), len(source.sensors)
-        if not kept:
+        if len(kept) == width - source.measured:
             raise UsageError(f"all sensors are constant in training: {names}")
         source.sensors = tuple(source.sensors[i] for i in kept)
         source._kept = (*kept, *range(width, len(source._kept)))  # noqa: SLF001
@@ -884,6 +897,12 @@ def _settle_columns(source: EpisodeSource, recipe: Recipe) -> None:
         cells = "".join(entry.where() for entry in source.ledger.of("cell", "kept"))
         raise TrajectoryError(f"sensor {name!r} reaches {largest:g}, too large for float32{cells}")
     blurred = is_coarse(spread, every.largest)
+    coarse = itertools.compress(source.sensors, blurred)
+    if scores := [q.name for q in coarse if q.role == "score"]:  # which are as they were recorded
+        names = ", ".join(scores)
+        problem = f"float32 cannot tell values of these scores: {names}"
+        source.notes.append(f"warning: {problem}; record them without what never changes")
+    blurred[source.measured :] = False
     if blurred.any():
         source.offsets = tuple(np.where(blurred, train.mean, 0.0).tolist())
         columns = zip(source.sensors, train.mean, spread, blurred, strict=True)

@@ -127,7 +127,7 @@ def _conditions(key: str, value: Any) -> dict[str, tuple[Any, ...]]:
 
 def _roles(key: str, value: Any) -> dict[str, tuple[str, ...]]:
     table = _table(key, value)
-    check_known(f"role of {key}", get_args(Role), *table)
+    check_known(f"role of {key}", [role for role in get_args(Role) if role != "score"], *table)
     return {role: read_names(f"{key}.{role}", globs) for role, globs in table.items()}
 
 
@@ -286,6 +286,10 @@ class Recipe:
         names the unit. Without sensors, the columns ``obs:NAME[UNIT]`` and ``action:NAME[UNIT]``.
     reward
         Column with rewards.
+    scores
+        Globs over columns that a monitor computed when the log was recorded, as for `sensors`:
+        columns with the role ``"score"`` behind the sensors, which no detector sees that does not
+        name them.
     discrete
         Number of actions, or their names, where each action is a whole number from 0 on.
     columns
@@ -348,6 +352,7 @@ class Recipe:
     sensors: Texts = ()
     actions: Texts = ()
     reward: Text = ""
+    scores: Texts = ()
     discrete: Annotated[int | tuple[str, ...], _discrete] = 0
     columns: Mapping[str, Any] = field(default_factory=dict)
     roles: Annotated[Mapping[str, tuple[str, ...]], _roles] = field(default_factory=dict)

@@ -249,7 +249,9 @@ class Converter:
 
     def __init__(self, selection: Selection, recipe: Recipe, start: int = 0) -> None:
         self._inputs = len(selection.sensors), len(selection.actions)
-        quantities = _with_roles([column.quantity for column in selection.sensors], recipe)
+        columns = [column.quantity for column in selection.sensors]
+        scores = [quantity for quantity in columns if quantity.role == "score"]  # the last ones
+        quantities = _with_roles(columns[: len(columns) - len(scores)], recipe)
         by_first: dict[int, Conversion] = {}
         converted: dict[int, str] = {}
         for key, value in recipe.columns.items():
@@ -263,6 +265,7 @@ class Converter:
                             f"{name!r} is named below {converted[i]} and {key}, expected one"
                         )
                     converted[i] = key
+        quantities += scores
         order = [i for i in range(len(quantities)) if i in by_first or i not in converted]
         self._parts = [
             by_first.get(i, Conversion((i,), (quantities[i],), lambda: np.asarray)) for i in order

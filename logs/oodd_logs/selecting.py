@@ -51,7 +51,7 @@ class Selection:
     Parameters
     ----------
     sensors, actions
-        In the order of the recipe, then of the file.
+        In the order of the recipe, then of the file; scores behind the sensors.
     reward
         Rewards, if any.
     times
@@ -163,6 +163,7 @@ def respellings(layout: Layout, recipe: Recipe, first: Layout | None) -> dict[tu
     pairs = [(topic, name, spelled(topic, name)) for topic, name in expected - there]
     names = {(topic, old): name for topic, name, old in pairs if old}
     texts = (*_texts_of(recipe), *recipe.sensors, *recipe.actions, recipe.reward, *recipe.time)
+    texts += recipe.scores
     plain = [t.rpartition("=")[2].strip() for t in texts if t and not {*t} & {*"*?"}]
     exact = {text: _matches(layout, text)[0] for text in plain}
     taken = {column for columns in exact.values() for column in columns}
@@ -237,23 +238,42 @@ def select_columns(layout: Layout, recipe: Recipe, source: str) -> Selection:
     UnknownNameError
         When a sensor, an action or the stamps are not there.
     UsageError
-        When no sensor is chosen, or two have one name.
+        When no sensor is chosen, two have one name, or a score is something else, too.
     """
     rewards_text = (recipe.reward,) if recipe.reward else ()
     texts = {"obs": recipe.sensors, "action": recipe.actions, "reward": rewards_text}
     chosen = {kind: _listed(layout, names, source) for kind, names in texts.items()}
+    scores = [
+        dataclasses.replace(c, quantity=dataclasses.replace(c.quantity, role="score"))
+        for c in _listed(layout, recipe.scores, source)
+    ]
     by_prefix = {} if recipe.sensors else _by_prefix(layout, source)
+    are_scores = {(c.topic, c.column) for c in scores}
+    for kind, columns in by_prefix.items():
+        by_prefix[kind] = [c for c in columns if (c.topic, c.column) not in are_scores]
     sensors, actions, rewards = (chosen[kind] or by_prefix.get(kind, []) for kind in texts)
-    for kind, columns in (("sensors", sensors), ("actions", actions)):
-        names = [column.quantity.name for column in columns]
-        if double := [name for name in names if names.count(name) > 1]:
-            advice = "rename one, 'new = old'"
-            raise UsageError(f"{source} has two {kind} named {double[0]!r}: {advice}")
     fields = [column for text in _texts_of(recipe) for column in find_columns(layout, text)]
     labels = {
         text: column for text in recipe.label_columns for column in find_columns(layout, text)[:1]
     }
     used = [*sensors, *actions, *rewards[:1], *labels.values()]
+    for c in (c for c in used if (c.topic, c.column) in are_scores):
+        name = _aliases(c.topic, c.column)[-1]
+        raise UsageError(
+            f"{source}: {name!r} is a score, and a sensor, action, reward or label, too: name it "
+            "in one of these keys"
+        )
+    if not sensors:
+        raise UsageError(
+            f"{source}: all columns are scores, expected a sensor: name one of them as that, since "
+            "column:NAME takes both"
+        )
+    sensors, used = [*sensors, *scores], [*used, *scores]
+    for kind, columns in (("sensors", sensors), ("actions", actions)):
+        names = [column.quantity.name for column in columns]
+        if double := [name for name in names if names.count(name) > 1]:
+            advice = "rename one, 'new = old'"
+            raise UsageError(f"{source} has two {kind} named {double[0]!r}: {advice}")
     times = _times(layout, dict.fromkeys(column.topic for column in used), recipe.time, source)
     named = {(c.topic, c.column) for c in (*used, *fields, *chain(*times.values()))}
     unused = tuple(_aliases(*column)[-1] for column in _pairs(layout) if column not in named)
@@ -277,6 +297,7 @@ def with_sensors(recipe: Recipe, recording: Recording) -> Recipe:
     if recipe.sensors or "obs" in {match[1].lower() for match in matches if match}:
         return recipe
     texts = [*recipe.actions, *_texts_of(recipe), *recipe.time, *filter(None, [recipe.reward])]
+    texts += recipe.scores
     named = {(c.topic, c.column) for text in texts for c in find_columns(layout, text)}
     unnamed = (pair for pair in _pairs(layout) if pair not in named)
     sensors = tuple(f"{topic}.{name}" if topic else name for topic, name in unnamed)

@@ -22,6 +22,7 @@ episode = ["robot", "run"]
 sensors = ["q*[rad]", "speed = v"]
 actions = "cmd*"
 reward = "r"
+scores = "*_innov"
 discrete = 3
 angles = ["q6"]
 constant = "drop"

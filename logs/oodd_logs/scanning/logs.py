@@ -97,11 +97,12 @@ def read_logs(
                 "file", "dropped", f"of another format, {ending or 'no ending'}", count=count
             )
         ledger.complete(source.ledger)
+        source.ledger = ledger
         return RecordedLogs(
             list(source.episodes(EVERY)),
             [*source.sensors],
             recipe.baseline,
             reader.name,
             ledger,
-            ledger.summary([q.name for q in source.sensors], source.recordings),
+            source.summary,
         )

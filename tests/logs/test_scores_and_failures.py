@@ -1,0 +1,126 @@
+"""Recipes that keep what a monitor computed, failed episodes for training, and unseen tasks."""
+
+import numpy as np
+import pytest
+from oodd_logs.importing import import_frames, import_recipe
+from oodd_logs.recipe import Recipe
+
+from oodd_eval.errors import TrajectoryError, UsageError
+
+ROWS = 50
+
+
+def tables(bad=False, n=12, seed=0):
+    """Recordings of two sensors, an innovation, and the flag that it raises."""
+    rng = np.random.default_rng(seed)
+    for _ in range(n):
+        innovation = np.abs(rng.normal(size=ROWS)) + 9 * bad * (np.arange(ROWS) >= 20)
+        yield {
+            "height": rng.normal(size=ROWS),
+            "yaw": rng.uniform(-np.pi, np.pi, ROWS),
+            "vel_innov": innovation,
+            "tripped": (innovation > 6).astype(float),
+        }
+
+
+@pytest.fixture
+def frames(tmp_path):
+    """Return a function that imports twelve nominal recordings and three faulty ones."""
+
+    def of(notes=None, **keys):
+        nominal = [*tables()]
+        return import_frames(
+            "flights",
+            train=nominal[:6],
+            calibration=nominal[6:],
+            test={"nominal": [*tables(n=2, seed=1)], "bad": [*tables(bad=True, n=3)]},
+            onset=20,
+            output=tmp_path / "split",
+            report=(notes if notes is not None else []).append,
+            **keys,
+        )
+
+    return of
+
+
+def test_a_score_is_kept_as_it_was_recorded_and_is_no_sensor(frames):
+    keys = {"angles": ["yaw"], "scores": ["*innov", "flag = tripped"], "constant": "drop"}
+    with frames(notes := [], **keys).opened() as opened:
+        data = opened("flights")
+        assert [q.name for q in data.sensors] == ["height", "sin yaw", "cos yaw"]
+        assert [q.name for q in data.columns[3:]] == ["vel_innov", "flag"]
+        assert {q.role for q in data.columns[3:]} == {"score"}
+        recorded = [*tables(bad=True, n=3)]
+        shown = data.of_columns(["vel_innov", "flag"]).labelled("bad")
+        for episode, table in zip(shown, recorded, strict=True):
+            expected = np.stack([table["vel_innov"], table["tripped"]], axis=1)
+            assert episode.observations == pytest.approx(expected, rel=1e-6)
+    text = "\n".join(notes)
+    assert "3 sensors, 0 actions, 2 scores" in text
+    assert "sensors: height, sin yaw, cos yaw; scores: vel_innov, flag" in text
+    # A flag is never raised where all is well: it stays, and that is said.
+    assert "scores that are constant in training, and kept: flag" in text
+
+
+def test_a_split_without_scores_has_the_digest_that_it_had(frames, tmp_path):
+    sensors = {"sensors": ["height", "yaw"]}
+    without = frames(**sensors).digest
+    assert frames(**sensors, scores=["tripped"], replace=True).digest != without
+    assert frames(**sensors, replace=True).digest == without
+
+
+@pytest.mark.parametrize(
+    ("keys", "expected"),
+    [
+        ({"sensors": ["height", "vel*"], "scores": ["vel_innov"]}, "'vel_innov' is a score, and a"),
+        ({"actions": ["vel_innov"], "scores": ["vel*"]}, "'vel_innov' is a score, and a sensor, a"),
+        ({"labels": ["tripped"], "scores": ["tripped"]}, "'tripped' is a score, and a sensor, act"),
+        ({"scores": ["chunk_mse"]}, "chunk_mse"),
+        ({"scores": ["height = vel_innov"]}, "two sensors named 'height'"),
+        ({"roles": {"score": ["height"]}}, "unknown role of import_frames: roles 'score'"),
+    ],
+)
+def test_a_score_that_is_something_else_too_is_refused(frames, keys, expected):
+    with pytest.raises(UsageError, match=expected):
+        frames(**keys)
+
+
+def csv_logs(folder, lines, n=12):
+    for i in range(n):
+        (folder / f"r{i}.csv").write_text("height,score\n" + "\n".join(lines(i)) + "\n")
+
+
+def imported(folder, **keys):
+    """Import files of two columns."""
+    content = {"split": "s", "sensors": ["height"], "scores": ["score"], **keys}
+    recipe = Recipe.parse({"nominal": {"files": "r*.csv"}, **content})
+    with import_recipe(recipe, folder, folder / "split").opened() as opened:
+        return [*opened("s").of_columns(["score"]).train]
+
+
+def test_a_sparse_score_is_held_and_not_shifted(tmp_path):
+    csv_logs(tmp_path, lambda i: [f"{i},{1e7 + row if row % 5 == 0 else ''}" for row in range(20)])
+    with pytest.raises(
+        TrajectoryError, match="column 'score' is missing, expected a finite number"
+    ):
+        imported(tmp_path)
+    held = imported(tmp_path, missing="hold")[0].observations.ravel()
+    assert held.tolist() == [1e7 + row // 5 * 5 for row in range(20)]
+
+
+def test_a_score_in_words_is_refused(tmp_path):
+    csv_logs(
+        tmp_path, lambda i: [f"{i + row / 9},{'high' if row % 2 else 'low'}" for row in range(20)]
+    )
+    with pytest.raises(TrajectoryError, match="column 'score' is 'low', expected a number"):
+        imported(tmp_path)
+
+
+def test_a_score_that_float32_cannot_tell_is_not_shifted_and_that_is_said(tmp_path):
+    csv_logs(tmp_path, lambda i: [f"{row / 9},{1e9 + row % 3}" for row in range(20)])
+    recipe = {"split": "s", "sensors": ["height"], "scores": ["score"]}
+    recipe = Recipe.parse({**recipe, "nominal": {"files": "r*.csv"}})
+    split = import_recipe(recipe, tmp_path, tmp_path / "split", report=(notes := []).append)
+    with split.opened() as opened:
+        assert not opened("s").logs.offsets
+    assert any("float32 cannot tell values of these scores: score" in note for note in notes)
