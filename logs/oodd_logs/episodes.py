@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from oodd_eval.data.bounded import EPISODES
 from oodd_eval.data.facts import ANOMALIES, Group, Quantity, in_order
 from oodd_eval.data.offsets import RunningMoments, is_coarse
-from oodd_eval.data.parts import CALIBRATION, TRAIN, TWINS
+from oodd_eval.data.parts import CALIBRATION, FAILURES, TRAIN, TWINS
 from oodd_eval.errors import TrajectoryError, UnknownNameError, UsageError
 from oodd_eval.metrics.faults import FAR
-from oodd_eval.names import check_known, counted
+from oodd_eval.names import check_known, counted, listed
 from oodd_logs.kinds import Matrix
 from oodd_logs.ledger import Item, Ledger
 from oodd_logs.marks import (
@@ -374,6 +374,7 @@ class _Reading:
     label_counts: LabelCounts = field(default_factory=lambda: defaultdict(Counter))
     unlabelled: set[str] = field(default_factory=set)  # label columns that recordings lack
     intervals: IntervalList = field(init=False)
+    unseen: frozenset[str] = field(init=False)  # tasks
 
     def __post_init__(self) -> None:
         if self.every:
@@ -381,6 +382,7 @@ class _Reading:
             gap = self.recipe.gap or (0.0 if stamped else None)
             self.recipe = dataclasses.replace(self.recipe, missing="keep", gap=gap, paired=False)
         self.intervals = IntervalList.of(self.recipe, self.root)
+        self.unseen = frozenset(map(text_of, self.recipe.unseen))
 
     @property
     def shortest(self) -> int:
@@ -683,6 +685,8 @@ class _Reading:
 
     def _keep(self, facts: EpisodeFacts, label: str) -> None:
         baseline, part = self.recipe.baseline, EVERY if self.every else facts.part
+        if part in NOMINAL_ROLES and facts.episode.task in self.unseen:
+            part = TWINS
         early = [start for start, _ in facts.episode.intervals if 0 <= start < baseline]
         if early and "#" not in facts.episode.name and not self.every:
             self.problems.append(
@@ -724,6 +728,8 @@ class _Reading:
             raise UsageError(problem)
         for problem in self.problems:
             raise TrajectoryError(problem)
+        self._check_unseen()
+        failed = self._failed_for_training()
         parts = self._shared_out()
         for part in (part for part in (TRAIN, CALIBRATION) if not parts[part]):
             why = f"[nominal] names no file with one for {part}"
@@ -739,6 +745,7 @@ class _Reading:
         if lacking and not kinds:
             raise UsageError(f"[anomalous.{lacking[0]}] has no episodes, expected at least one")
         parts |= {f"test/{kind}": self.parts[f"test/{kind}"] for kind in kinds}
+        parts |= {FAILURES: failed} if failed else {}
         source = self._source(parts)
         groups = {kind: recipe.anomalous.get(kind, _NO_FILES).group for kind in kinds}
         source.groups = groups | {k: ANOMALIES[k].group for k in kinds if k in ANOMALIES}
@@ -747,6 +754,32 @@ class _Reading:
         if lacking:
             source.notes.append(f"no episodes of these anomalies: {', '.join(lacking)}")
         return source
+
+    def _check_unseen(self) -> None:
+        """Raise `UsageError` unless there are the unseen tasks, and others."""
+        tasks = dict.fromkeys(f.episode.task for facts in self.parts.values() for f in facts)
+        check_known("task (unseen)", tasks, *sorted(self.unseen))
+        if self.unseen and self.unseen >= {*tasks}:
+            raise UsageError(f"unseen names all tasks, {listed([*tasks])}: none is for training")
+
+    def _failed_for_training(self) -> list[EpisodeFacts]:
+        """Take the first failed episodes of each task that is seen out of the parts of the test."""
+        failed = [
+            facts
+            for part, episodes in self.parts.items()
+            for facts in episodes
+            if part not in NOMINAL_ROLES and facts.episode.outcome is False
+            if facts.episode.task not in self.unseen
+        ]
+        failed.sort(key=lambda facts: facts.begin if self.by_stamps else facts.first)
+        taken: set[EpisodeFacts] = set()
+        for task in {facts.episode.task for facts in failed}:
+            of_task = [facts for facts in failed if facts.episode.task == task]
+            taken |= {*of_task[: int(np.rint(self.recipe.failures * len(of_task)))]}
+        for part, episodes in self.parts.items():
+            self.parts[part] = [facts for facts in episodes if facts not in taken]
+        self.parts = {part: episodes for part, episodes in self.parts.items() if episodes}
+        return [facts for facts in failed if facts in taken]
 
     def _source(self, parts: dict[str, list[EpisodeFacts]]) -> EpisodeSource:
         if self.first is None or not any(parts.values()):
@@ -801,7 +834,7 @@ class _Reading:
             marked = counted(sum(b - max(a, 0) for a, b in intervals), "anomalous row(s)")
             said = f", {counted(len(intervals), 'interval(s)')} with {marked}"
             said = said if intervals else ", known by their outcome alone"
-            line += "" if part in _SHARED else said
+            line += "" if part in {*_SHARED, FAILURES} else said
             if episodes or part != TWINS:
                 lines.append(line)
             if part in self.cut_by_outcome:
@@ -814,6 +847,10 @@ class _Reading:
             how = "in the order of their stamps" if self.by_stamps else "in the order of files"
             how = f"shuffled (seed {recipe.seed})" if recipe.order == "shuffled" else how
             lines.append(f"nominal episodes were shared out {how}")
+        if recipe.failures and FAILURES not in source.parts:
+            lines.append(
+                f"no failed episode is for training: failures = {recipe.failures:g} of few"
+            )
         if self.steps and source.rate is None:
             steps = self._all_steps()
             shortest, longest = min(s.shortest for s in steps), max(s.longest for s in steps)

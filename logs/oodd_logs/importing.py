@@ -30,7 +30,7 @@ from oodd_eval.data.facts import (
 )
 from oodd_eval.data.files import only_writer, refuse_inputs
 from oodd_eval.data.layout import IMPORTED, Blocks
-from oodd_eval.data.parts import CALIBRATION, TRAIN, TWINS
+from oodd_eval.data.parts import CALIBRATION, FAILURES, NOMINAL, TRAIN, TWINS
 from oodd_eval.data.split import Split, data_home
 from oodd_eval.errors import TrajectoryError, UnknownNameError, UsageError
 from oodd_eval.names import check_known
@@ -411,7 +411,7 @@ def _write(
 def _groups(source: EpisodeSource, progress: Say, *, paired: bool) -> Iterator[tuple[str, _Arrays]]:
     """Yield the datasets of each part."""
     for part, episodes in source.parts.items():
-        is_anomalous = part not in {TRAIN, CALIBRATION, TWINS}
+        is_anomalous = part not in {*NOMINAL, FAILURES}
         twins = paired and is_anomalous
         arrays = _with_twins(source, part, episodes) if twins else _rows(source, episodes)
         if not paired:

@@ -93,6 +93,12 @@ def _whole(least: int, also: int | None = None) -> Callable[[str, Any], int]:
     return read
 
 
+def _share(key: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= 1:
+        raise wrong_value(key, value, "a share from 0 to 1")
+    return float(value)
+
+
 def _one_of(types: Any, expected: str) -> Callable[[str, Any], Any]:
     def read(key: str, value: Any) -> Any:
         if not isinstance(value, types):
@@ -126,9 +132,15 @@ def _conditions(key: str, value: Any) -> dict[str, tuple[Any, ...]]:
 
 
 def _roles(key: str, value: Any) -> dict[str, tuple[str, ...]]:
-    table = _table(key, value)
-    check_known(f"role of {key}", [role for role in get_args(Role) if role != "score"], *table)
-    return {role: read_names(f"{key}.{role}", globs) for role, globs in table.items()}
+    roles = [role for role in get_args(Role) if role != "score"]  # which the key scores gives
+    check_known(f"role of {key}", roles, *_table(key, value))
+    return _blocks(key, value)
+
+
+def _blocks(key: str, value: Any) -> dict[str, tuple[str, ...]]:
+    for name in (name for name in _table(key, value) if not re.fullmatch(r"[^\[\]]+", name)):
+        raise wrong_value(f"a name of {key}", name, "one without brackets, as they get numbers")
+    return {name: read_names(f"{key}.{name}", globs) for name, globs in value.items()}
 
 
 def _discrete(key: str, value: Any) -> int | tuple[str, ...]:
@@ -297,6 +309,9 @@ class Recipe:
     roles
         Globs of sensors by their role, see `oodd_eval.Quantity`. Sine and cosine of angles that are
         replaced by them have these roles where the sensor's is ``"angle"``.
+    blocks
+        Globs of sensors and scores, by the name of their block: they become ``NAME[0]``,
+        ``NAME[1]`` and so on, once all else that the recipe says is done.
     constant
         What becomes of sensors that are constant in the training part: ``"keep"`` or ``"drop"``.
     missing
@@ -313,10 +328,14 @@ class Recipe:
         First anomalous row of each anomalous file, and the row after the last, if always the same.
     outcome
         Field, or column, that is true of episodes that succeeded: others are anomalous.
+    failures
+        Share of the failed episodes of each task, the first as recorded, that are for training.
     kinds
         Field, or column, whose value names the anomaly of each episode.
     task
         Field, or column, with the task or set point of each episode.
+    unseen
+        Tasks whose episodes are all for the test.
     baseline
         Number of rows at the start of every episode that are nominal and not judged; 0 for none.
     window
@@ -356,6 +375,7 @@ class Recipe:
     discrete: Annotated[int | tuple[str, ...], _discrete] = 0
     columns: Mapping[str, Any] = field(default_factory=dict)
     roles: Annotated[Mapping[str, tuple[str, ...]], _roles] = field(default_factory=dict)
+    blocks: Annotated[Mapping[str, tuple[str, ...]], _blocks] = field(default_factory=dict)
     constant: Annotated[Literal["keep", "drop"], _choice("keep", "drop")] = "keep"
     missing: Annotated[Missing, _choice("refuse", "hold", "drop")] = "refuse"
     missing_rows: Whole = MISSING_ROWS
@@ -365,8 +385,10 @@ class Recipe:
     onset: Row = None
     stop: Stop = None
     outcome: Text = ""
+    failures: Annotated[float, _share] = 0.0
     kinds: Text = ""
     task: Text = ""
+    unseen: Annotated[tuple[Any, ...], _scalars] = ()
     baseline: Length = 0
     window: Length = 0
     clock: Flag = True
@@ -490,6 +512,10 @@ class Recipe:
             raise UsageError(f"{source}: [nominal] names twins, expected paired = true with them")
         if self.gap is not None and not self.time and self.rate is None:
             raise UsageError(f"{source}: gap needs stamps: name their column with time")
+        if self.failures and not self.outcome:
+            raise UsageError(f"{source}: failures are known by their outcome: name its field, too")
+        if self.unseen and not self.task:
+            raise UsageError(f"{source}: unseen names tasks: name the field with them (task), too")
         if self.stop is not None and self.onset is None:
             raise UsageError(f"{source}: stop is the end of what onset begins: name onset, too")
 

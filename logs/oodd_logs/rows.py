@@ -4,9 +4,10 @@ Nothing here holds more than a block of a recording; what comes out is float64.
 """
 
 import contextlib
+import itertools
 import tempfile
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final, cast
 
@@ -271,7 +272,8 @@ class Converter:
             by_first.get(i, Conversion((i,), (quantities[i],), lambda: np.asarray)) for i in order
         ]
         self._made: list[Callable[[Matrix], Matrix]] = []
-        self.sensors = tuple(quantity for part in self._parts for quantity in part.outputs)
+        outputs = [quantity for part in self._parts for quantity in part.outputs]
+        self.sensors = tuple(_in_blocks(outputs, recipe))
         for sensor in self.sensors:
             if sensor.role == "angle" and sensor.unit in FULL_TURN:
                 expected = "rad; list it under angles, too, to replace it by sine and cosine"
@@ -327,14 +329,34 @@ class Converter:
 
 def _with_roles(sensors: Sequence[Quantity], recipe: Recipe) -> list[Quantity]:
     """Return sensors with the roles that a recipe names, one each."""
+    roles = _members("role", recipe.roles, sensors)
+    return [replace(q, role=cast("Role", roles.get(i, q.role))) for i, q in enumerate(sensors)]
+
+
+def _in_blocks(sensors: Sequence[Quantity], recipe: Recipe) -> list[Quantity]:
+    """Return sensors with the names of their blocks, and numbers behind these."""
+    blocks = _members("block", recipe.blocks, sensors)
+    numbers: dict[str, Iterator[int]] = defaultdict(itertools.count)
+    renamed = {i: f"{blocks[i]}[{next(numbers[blocks[i]])}]" for i in sorted(blocks)}
+    named = [replace(q, name=renamed.get(i, q.name)) for i, q in enumerate(sensors)]
+    names = [quantity.name for quantity in named]
+    for name in (name for name in renamed.values() if names.count(name) > 1):
+        raise UsageError(f"blocks: another column is called {name!r}: give the block another name")
+    return named
+
+
+def _members(
+    kind: str, globs: Mapping[str, Sequence[str]], sensors: Sequence[Quantity]
+) -> dict[int, str]:
+    """Return the role, or block, of the sensors that have one, by their positions."""
     named: dict[int, str] = {}
-    for role, patterns in recipe.roles.items():
-        for i in matching(patterns, sensors, f"sensor whose role is {role}"):
+    for name, patterns in globs.items():
+        for i in matching(patterns, sensors, f"sensor whose {kind} is {name}"):
             if i in named:
-                roles = f"{named[i]} and {role}"
-                raise UsageError(f"roles: {sensors[i].name!r} is {roles}, expected one role")
-            named[i] = role
-    return [replace(q, role=cast("Role", named.get(i, q.role))) for i, q in enumerate(sensors)]
+                both = f"{named[i]} and {name}"
+                raise UsageError(f"{kind}s: {sensors[i].name!r} is {both}, expected one {kind}")
+            named[i] = name
+    return named
 
 
 def _actions(columns: Sequence[ChosenColumn], recipe: Recipe) -> tuple[Quantity, ...]:

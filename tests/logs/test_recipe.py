@@ -34,14 +34,17 @@ intervals = [["a.csv", 3, 9], ["b.csv", 2013-12-10T06:25:00, "", "leak"]]
 onset = 10
 stop = 20
 outcome = "success"
+failures = 0.5
 kinds = "class"
 task = "task_id"
+unseen = [7, "stack"]
 baseline = 100
 window = 600
 clock = false
 order = "shuffled"
 seed = 4
 paired = false
+blocks = {chunk = "q*"}
 [roles]
 angle = "q6"
 [read]

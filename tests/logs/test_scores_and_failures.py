@@ -124,3 +124,106 @@ def test_a_score_that_float32_cannot_tell_is_not_shifted_and_that_is_said(tmp_pa
     with split.opened() as opened:
         assert not opened("s").logs.offsets
     assert any("float32 cannot tell values of these scores: score" in note for note in notes)
+
+
+def rollouts(folder, tasks=("0", "1", "2"), n=20):
+    """Write a file a rollout, every second of which failed, with the task in a column."""
+    rng = np.random.default_rng(0)
+    for task in tasks:
+        for i in range(n):
+            rows = [f"{i},{rng.normal()},{task},{i % 2}" for _ in range(9)]
+            text = "\n".join(["number,chunk_mse,task,success", *rows]) + "\n"
+            (folder / f"task{task}-{i:02}.csv").write_text(text)
+
+
+OUTCOMES = {
+    "split": "s", "sensors": ["number"], "scores": ["chunk_mse"], "outcome": "success",
+    "task": "task", "nominal": {"files": "*.csv"},
+}  # fmt: skip
+
+
+def parts(folder, notes=None, **keys):
+    """Import rollouts; return task and number of the episodes of each part."""
+    report = (notes if notes is not None else []).append
+    recipe = Recipe.parse(OUTCOMES | keys)
+    split = import_recipe(recipe, folder, folder / "split", replace=True, report=report)
+    with split.opened() as opened:
+        data = opened("s")
+        sets = {"train": data.train, "calibration": data.calibration, "nominal": data.twins}
+        sets |= {name: data.labelled(name) for name in data.anomalies}
+        sets |= {"failures": data.failures} if data.failures else {}
+        return {
+            name: [(t, int(e.observations[0, 0])) for t, e in zip(part.tasks, part, strict=True)]
+            for name, part in sets.items()
+        }
+
+
+def test_the_first_failed_episodes_of_each_task_are_for_training(tmp_path):
+    rollouts(tmp_path)
+    without, found = parts(tmp_path), parts(tmp_path, notes := [], failures=0.3)
+    failed = [(task, i) for task in "012" for i in range(0, 20, 2)]
+    assert (without["failure"], "failures" in without) == (failed, False)
+    assert found["failures"] == [(task, i) for task, i in failed if i < 6]
+    assert found["failure"] == [(task, i) for task, i in failed if i >= 6]
+    assert {k: found[k] for k in without if k != "failure"} == {
+        k: without[k] for k in without if k != "failure"
+    }
+    assert "failures: 9 episodes, 81 rows" in notes
+    assert "failures" not in parts(tmp_path, notes, failures=0.01)
+    assert "no failed episode is for training: failures = 0.01 of few" in notes
+
+
+def test_unseen_tasks_are_in_the_test_alone(tmp_path):
+    rollouts(tmp_path)
+    found = parts(tmp_path, unseen=[1], failures=0.5)
+    assert {task for name in ("train", "calibration", "failures") for task, _ in found[name]} == {
+        "0", "2",
+    }  # fmt: skip
+    assert [i for task, i in found["nominal"] if task == "1"] == [*range(1, 20, 2)]
+    assert [i for task, i in found["failure"] if task == "1"] == [*range(0, 20, 2)]
+    # The other tasks are shared out as without it.
+    seen = parts(tmp_path, failures=0.5)
+    for name, episodes in seen.items():
+        others = [episode for episode in found[name] if episode[0] != "1"]
+        assert others == [episode for episode in episodes if episode[0] != "1"]
+
+
+@pytest.mark.parametrize(
+    ("keys", "expected"),
+    [
+        ({"unseen": ["3"]}, "unknown task .unseen. '3'.*0, 1, 2"),
+        ({"unseen": ["0", "1", "2"]}, "unseen names all tasks, 0, 1 and 2: none is for training"),
+        ({"unseen": ["0"], "task": ""}, "unseen names tasks: name the field with them .task., too"),
+        ({"failures": 0.5, "outcome": ""}, "failures are known by their outcome: name its field"),
+        ({"failures": 2}, "failures is 2, expected a share from 0 to 1"),
+    ],
+)
+def test_errors_of_failures_and_unseen_tasks_say_what_to_do(tmp_path, keys, expected):
+    rollouts(tmp_path)
+    with pytest.raises(UsageError, match=expected):
+        parts(tmp_path, **keys)
+
+
+def test_columns_of_a_block_are_numbered_and_have_their_conversions_and_roles(frames):
+    blocks = {"state": ["*yaw", "height"], "chunk": ["vel_innov", "tripped"]}
+    roles = {"position": ["height"], "angle": ["yaw"]}
+    keys = {"angles": ["yaw"], "roles": roles, "scores": ["vel*", "tripped"]}
+    with frames(**keys, blocks=blocks).opened() as opened:
+        data = opened("flights")
+        state = ["state[0]", "state[1]", "state[2]"]
+        assert [q.name for q in data.columns] == [*state, "chunk[0]", "chunk[1]"]
+        assert [q.role for q in data.columns] == ["position", "sine", "cosine", "score", "score"]
+        assert [q.name for q in data.of_columns(["chunk"]).sensors] == ["chunk[0]", "chunk[1]"]
+
+
+@pytest.mark.parametrize(
+    ("blocks", "expected"),
+    [
+        ({"chunk": ["hei*"], "samples": ["*t"]}, "'height' is chunk and samples, expected one b"),
+        ({"chunk[0]": ["height"]}, "a name of import_frames: blocks is 'chunk.0.', expected one wit"),
+        ({"chunk": ["weight"]}, "unknown sensor whose block is chunk 'weight'"),
+    ],
+)  # fmt: skip
+def test_errors_of_blocks_say_what_to_do(frames, blocks, expected):
+    with pytest.raises(UsageError, match=expected):
+        frames(blocks=blocks)
