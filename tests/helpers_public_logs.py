@@ -274,4 +274,4 @@ def pi0(root):
 WRITERS = {
     writer.__name__: writer
     for writer in (skab, alfa, rosa, tep, uci, cwru, nab, ur3, lerobot, pi0)
-}  # fmt: skip
+} | {"pi0-failures": pi0}  # fmt: skip

@@ -46,6 +46,8 @@ SETS = {
     "lerobot": (30, (4, 4, 2), {}, {}),
     # Failures are known by their outcome alone; tasks are shared out each for itself.
     "pi0": (None, (2 * 16, 2 * 14, 2 * 10), {"failure": 2 * 10}, {"failure": [[]] * 20}),
+    # Half of each task's failures are for training.
+    "pi0-failures": (None, (2 * 16, 2 * 14, 2 * 10), {"failure": 2 * 5}, {"failure": [[]] * 10}),
 }  # fmt: skip
 """Rate in Hz, episodes of the nominal parts and of each anomaly, and intervals of some."""
 
@@ -75,7 +77,8 @@ def sizes(data):
 
 
 def test_every_set_has_a_writer_and_its_sizes():
-    assert {*shipped_recipes()} == {*WRITERS} == {*SETS} == {*public_logs.ORDER}
+    # What learns from failures has a page of its own.
+    assert {*shipped_recipes()} == {*WRITERS} == {*SETS} == {*public_logs.ORDER, "pi0-failures"}
 
 
 def test_the_page_has_the_committed_records_and_what_they_are_of():
@@ -119,7 +122,13 @@ def test_columns_and_names_of_some_sets(imported):
     # The last row's action led to nothing that was recorded.
     first = imported("lerobot")[1].train[0]
     assert (first.observations.shape, first.actions.shape) == ((160, 26), (159, 26))
-    assert {*imported("pi0")[1].labelled("failure").tasks} == {"0", "2"}
+    pi0, failures = imported("pi0")[1], imported("pi0-failures")[1]
+    failed, left, learnt = pi0.labelled("failure"), failures.labelled("failure"), failures.failures
+    assert ({*failed.tasks}, pi0.failures) == ({"0", "2"}, None)
+    assert learnt.names == (*failed.names[:5], *failed.names[10:15])
+    assert left.names == (*failed.names[5:10], *failed.names[15:])
+    for part in ("train", "calibration", "twins"):
+        assert getattr(pi0, part).names == getattr(failures, part).names
 
 
 @pytest.mark.parametrize("name", WRITERS)

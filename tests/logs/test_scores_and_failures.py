@@ -220,7 +220,7 @@ def test_columns_of_a_block_are_numbered_and_have_their_conversions_and_roles(fr
     ("blocks", "expected"),
     [
         ({"chunk": ["hei*"], "samples": ["*t"]}, "'height' is chunk and samples, expected one b"),
-        ({"chunk[0]": ["height"]}, "a name of import_frames: blocks is 'chunk.0.', expected one wit"),
+        ({"chunk[0]": ["height"]}, "a name of import_frames: blocks is 'chunk.0.', expect"),
         ({"chunk": ["weight"]}, "unknown sensor whose block is chunk 'weight'"),
     ],
 )  # fmt: skip
