@@ -1,5 +1,11 @@
 """Monitors of other people: a threshold with a reason for a score that was computed elsewhere."""
 
-from oodd_monitors.calibrating import ScoreCalibration, calibrate
+from oodd_monitors.calibrating import (
+    Detections,
+    LabelledScores,
+    ScoreCalibration,
+    ScoreGroup,
+    calibrate,
+)
 
-__all__ = ["ScoreCalibration", "calibrate"]
+__all__ = ["Detections", "LabelledScores", "ScoreCalibration", "ScoreGroup", "calibrate"]
