@@ -180,6 +180,17 @@ class ScoreCalibration:
         return f"at most {100 * self.level:.3g} % of further healthy {noun} alarm"
 
     @property
+    def notes(self) -> tuple[str, ...]:
+        """What puts the promise in doubt, in sentences."""
+        test = self.drift
+        drift = (
+            "The score drifts: its largest values follow the order of the logs (rank correlation "
+            f"{test.statistic:.2f}, p = {test.p:.2g}), so that more logs than promised may alarm. "
+            "Calibrate on logs of the days that are judged, or on the newest alone."
+        )
+        return (drift,) if test.significant else ()
+
+    @property
     def share_interval(self) -> tuple[float, float] | None:
         """The true share of alarms at this threshold is in it for 95 % of such calibrations.
 

@@ -79,6 +79,10 @@ COMMANDS: Final[Mapping[str, Commands]] = {
         "run": ("fit and score every selected cell", "oodd_eval.cli.run:run"),
         "show": ("print the tables of earlier results", "oodd_eval.cli.show:show"),
         "scan": ("find odd episodes in recorded logs", "oodd_logs.commands.scan_logs:scan"),
+        "calibrate": (
+            "find the threshold of a recorded score",
+            "oodd_monitors.commands.calibrate_score:calibrate_score",
+        ),
         "compare": ("compare rows, or results with a reference", "oodd_eval.cli.compare:compare"),
         "forget": ("remove cells from a results directory", "oodd_eval.cli.forget:forget"),
         "intervene": (

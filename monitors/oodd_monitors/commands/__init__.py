@@ -1,0 +1,1 @@
+"""The command that sets the threshold of a recorded score."""
