@@ -45,6 +45,7 @@ NOT_RUN = [
         r"^(export|pip download|python -m zipfile) |^pip install -e examples/oodd-go1",
         "gets a robot that others published",
     ),
+    Rule(r"^OODD_WATCHDOG=\S+ inspect-robots ", "a program of others; test_inspect_robots runs it"),
     Rule(
         r"^rm -rf dist$|^python -m build$|\.ci/check-dist", "test_packaging builds and tries both"
     ),
@@ -69,6 +70,7 @@ PARSED_ONLY = [
          "test_reproduce_run renders what minutes did"),
     Rule(r"^oodd-eval data (inspect|import) (g1|bags|mug)\b",
          "needs a data set of LeRobot, or a bag; tests of the readers write both"),
+    Rule(r"^oodd-eval data import cube\.toml$", "needs trials; test_inspect_robots records them"),
     Rule(r"^oodd-eval data import plant --env pump ", "test_import imports such parts"),
     Rule(r"^oodd-eval .*\b(go1|walks)\b", "needs a robot that others published"),
     Rule(r"--executor dask://", "needs a cluster; test_executors starts one"),

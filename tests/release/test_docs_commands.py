@@ -154,6 +154,7 @@ KNOWN = {
         # Two calibration episodes keep no promise of 5 %.
         "rules": {r"--seeds 2": "--seeds 2 --level 50"},
     },
+    "examples/oodd-inspect-robots/README.md": {"folders": ["examples/oodd-inspect-robots"]},
     # The other two train networks for a minute.
     "detectors/rivals/README.md": {"rules": {r"(?<=pca,knn,deedee),rnd,paano": ""}},
     "detectors/rivals/networks.md": {"rules": {r"(--detector \S+)": r"\1 --param updates=20"}},
@@ -183,6 +184,7 @@ FRAGMENTS = {
     "README.md": "test_live_wrappers runs it and reads what it prints",
     "docs/board-data.md": "test_the_documents_program_reads_the_table builds a board for it",
     "examples/oodd-go1/README.md": "needs episodes of a robot that others published",
+    "examples/oodd-inspect-robots/README.md": "test_inspect_robots runs it, and reads its figures",
     "docs/tutorial.md": "a piece of the test file that `new` writes, which test_new runs",
     "detectors/README.md": "the plug-in that the commands of the page run",
 }
