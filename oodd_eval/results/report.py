@@ -189,7 +189,9 @@ def flat(records: Sequence[Record]) -> list[dict[str, Any]]:
     return [
         {
             **{n: getattr(r, n) for n in names},
-            "promise": "; ".join(filter(None, (tables.unpromised(r, s) for s in LEVELS))),
+            "promise": "; ".join(
+                filter(None, dict.fromkeys(tables.unpromised(r, s) for s in LEVELS))
+            ),
             "row": str(r.setting),
             **{n: r.value(n) for n in metrics},
             **{n: getattr(r, n) for n in costs},

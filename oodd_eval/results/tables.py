@@ -702,7 +702,7 @@ def uncalibrated(board: Board) -> list[str]:
 
 def _lacks_draws(record: Record) -> bool:
     alarms = "far" in record.metrics or any("false_episodes" in name for name in record.metrics)
-    return alarms and not record.calibration_draws
+    return alarms and not record.calibration_draws and record.alarm != "flag"
 
 
 def _episodes(board: Board) -> list[str]:

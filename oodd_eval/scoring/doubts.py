@@ -3,6 +3,8 @@
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 
+import numpy as np
+
 from oodd_eval.data.parts import CALIBRATION, lengths_of
 from oodd_eval.data.split import Split
 from oodd_eval.metrics.promise import PromiseFinding, achieved_share
@@ -39,6 +41,8 @@ def doubts_after(
 ) -> Iterator[tuple[str, PromiseFinding]]:
     """Yield detectors whose later calibration episodes alarm more than the earlier ones promise.
 
+    A recorded score that is an alarm already is named, too.
+
     Parameters
     ----------
     plan, split, results
@@ -47,12 +51,13 @@ def doubts_after(
     Yields
     ------
     tuple
-        Name of an environment, and the share that was achieved there.
+        Name of an environment, and the share that was achieved there, or the alarm.
     """
     with split.opened() as opened:
         for unit in plan.units:
             data = opened(unit.environment)
-            if unit.alarm == "flag" or not in_recorded_order(data):
+            in_order = in_recorded_order(data)
+            if unit.alarm == "flag" or not (in_order or unit.alarm == "column"):
                 continue
             lengths = lengths_of({CALIBRATION: data.calibration}, plan.limit)
             scores = results.scores(unit.scores_key, lengths)
@@ -60,6 +65,11 @@ def doubts_after(
                 continue
             label = unit.setting.label(unit.seed)
             calibration, recordings = scores.parts[CALIBRATION], data.recordings(CALIBRATION)
+            if unit.alarm == "column" and {*np.concatenate(calibration).tolist()} <= {0.0, 1.0}:
+                text = f"{label} is 0 or 1, as an alarm is: flag:{unit.columns[0]} judges it as one"
+                yield unit.environment, PromiseFinding("achieved", text, doubt=True)
+            if not in_order:
+                continue
             recordings = recordings and recordings[: len(calibration)]
             finding = achieved_share(calibration, unit.alarm, label, recordings)
             if finding is not None and finding.doubt:
