@@ -12,8 +12,10 @@ of the AUC, and its value is A.
 """
 
 import itertools
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
@@ -33,6 +35,11 @@ UNKNOWN: Final = -1
 
 LEAST_NOMINAL: Final = 5
 """Nominal episodes that must have a row for anomalous episodes to be compared with them there."""
+
+OUTCOME_UP_TO: Final[Mapping[str, float]] = MappingProxyType(
+    {"auc_outcome": 1.0, "auc_outcome_half": 0.5, "auc_outcome_whole": math.inf}
+)
+"""Shares of the shortest length in the task that outcomes are compared up to, by metric."""
 
 BUFFER: Final = 100
 """Rows of the widest buffer around intervals in ``vus_pr``."""
@@ -125,8 +132,10 @@ def anomalous_rows(intervals: Intervals, rows: int) -> Mask:
     return mask
 
 
-def separability(cell: UnpairedScores, statistic: GuaranteedAlarm) -> Metrics:
-    """Return the AUCs of one cell without twins.
+def separability(
+    cell: UnpairedScores, statistic: GuaranteedAlarm, *, supervised: bool = False
+) -> Metrics:
+    """Return the AUCs of one cell without twins, and how good probabilities of failure are.
 
     ``auc_pool`` compares every anomalous row t with row t of the nominal test episodes of the task
     that have one, if there are at least five, and takes the mean over rows and then over episodes.
@@ -134,7 +143,10 @@ def separability(cell: UnpairedScores, statistic: GuaranteedAlarm) -> Metrics:
     episodes with the others of their task on the rows of anomalous ones: the k-th of a task on
     those of the k-th anomalous episode, from the first again after the last. ``auc_rows`` compares
     rows inside the intervals with the other rows of their episode. ``auc_outcome`` compares largest
-    statistics up to the shortest length in the task, of episodes without intervals.
+    statistics up to the shortest length in the task, of episodes without intervals;
+    ``auc_outcome_half`` those up to half of it, and ``auc_outcome_whole`` those of whole episodes.
+    ``brier_outcome`` is the mean over rows up to the shortest length of the squared distance of a
+    probability of failure from the outcome, 1 or 0; mean over all of these episodes.
 
     Parameters
     ----------
@@ -142,6 +154,9 @@ def separability(cell: UnpairedScores, statistic: GuaranteedAlarm) -> Metrics:
         The scores.
     statistic
         Of the alarms; its threshold does not matter.
+    supervised
+        Whether the detector learns from failures. Its scores are probabilities of failure where all
+        are within [0, 1].
 
     Returns
     -------
@@ -157,7 +172,10 @@ def separability(cell: UnpairedScores, statistic: GuaranteedAlarm) -> Metrics:
             rows[i] = auc(scores[mask], scores[~mask])
         metrics["auc_rows"] = _of_anomalous(cell, mean_of(rows))
     if cell.by_outcome:
-        metrics["auc_outcome"] = _outcome(cell, statistic)
+        metrics |= {n: _outcome(cell, statistic, share) for n, share in OUTCOME_UP_TO.items()}
+        pooled = np.concatenate([*cell.nominal, *cell.anomalous])
+        if supervised and not ((pooled < 0) | (pooled > 1)).any():
+            metrics["brier_outcome"] = _brier(cell)
     return metrics
 
 
@@ -361,17 +379,29 @@ def _pool_null(cell: UnpairedScores) -> Contribution:
     return _of_nominal(cell, terms)
 
 
-def _outcome(cell: UnpairedScores, statistic: GuaranteedAlarm) -> Contribution:
+def _outcome(cell: UnpairedScores, statistic: GuaranteedAlarm, share: float) -> Contribution:
     placements = []
     for nominal, failed, rows in _outcomes(cell):
+        stop = math.ceil(share * rows) if math.isfinite(share) else None
         judged, references = (
-            [np.array([statistic.largest(part[k][:rows])]) for k in indices]
+            [np.array([statistic.largest(part[k][:stop])]) for k in indices]
             for part, indices in ((cell.anomalous, failed), (cell.nominal, nominal))
         )
         masks = [np.ones(1, dtype=bool)] * len(failed)
         of_task = _placements(judged, masks, references, clock=False)
         placements.append((nominal, failed, of_task))
     return _of_both(cell, placements)
+
+
+def _brier(cell: UnpairedScores) -> Contribution:
+    m, n = cell.sizes
+    squares = np.full(m + n, np.nan)
+    for nominal, failed, rows in _outcomes(cell):
+        for j in nominal:
+            squares[j] = mean_of(cell.nominal[j][:rows] ** 2).value
+        for i in failed:
+            squares[m + i] = mean_of((1 - cell.anomalous[i][:rows]) ** 2).value
+    return replace(mean_of(squares), nominal=m)
 
 
 def _of_both(
@@ -464,7 +494,9 @@ def unpaired_alarms(
     anomalous episode of the task that has one, from the first again after the last; tasks count as
     often as they have such episodes, since they differ in how often they alarm. An interval is
     found where an alarm begins in it (``events_found``). ``found_outcome`` and its null count
-    alarms up to the shortest length in the task.
+    alarms up to the shortest length in the task, ``balanced_outcome`` is the mean of the first and
+    of what the second leaves, and ``outcome_time`` has the rows of failed episodes before the
+    alarm, or the shortest length.
 
     Parameters
     ----------
@@ -542,16 +574,37 @@ def _found_outcome(
     cell: UnpairedScores, rule: GuaranteedAlarm, rules: Sequence[GuaranteedAlarm]
 ) -> Metrics:
     m, n = cell.sizes
-    alarmed, quiet = np.full(n, np.nan), np.full(m, np.nan)
+    alarmed, quiet, times = np.full(n, np.nan), np.full(m, np.nan), np.full(n, np.nan)
     for nominal, failed, rows in _outcomes(cell):
-        alarmed[failed] = [rule.first(cell.anomalous[i][:rows]) is not None for i in failed]
+        firsts = [rule.first(cell.anomalous[i][:rows]) for i in failed]
+        alarmed[failed] = [first is not None for first in firsts]
+        times[failed] = [rows if first is None else first for first in firsts]
         quiet[nominal] = [rules[j].first(cell.nominal[j][:rows]) is not None for j in nominal]
+    weights = _task_weights(cell, cell.by_outcome)
+    loud = _of_anomalous(cell, mean_of(alarmed))
+    null = _of_nominal(cell, _weighted(mean_of(quiet), weights))
     return {
-        "found_outcome": _of_anomalous(cell, mean_of(alarmed)),
-        "found_outcome_null": _of_nominal(
-            cell, _weighted(mean_of(quiet), _task_weights(cell, cell.by_outcome))
-        ),
+        "found_outcome": loud,
+        "found_outcome_null": null,
+        "balanced_outcome": _balanced(loud, null),
+        "outcome_time": _of_anomalous(cell, mean_of(times)),
     }
+
+
+def _balanced(loud: Contribution, null: Contribution) -> Contribution:
+    """Return the mean of the share of failed episodes found and of nominal ones without alarm."""
+    quiet = replace(null, numerator=null.denominator - null.numerator)
+    value = (loud.value + quiet.value) / 2
+    if math.isnan(value):
+        return loud
+    # As in `two_sample`: the denominators of both samples sum to the same, and each side's terms
+    # are shifted to the value, so that resampling has the variance of the mean of both.
+    total = loud.denominator.sum() + quiet.denominator.sum()
+    terms = np.zeros((2, len(loud.numerator)))
+    for side in (loud, quiet):
+        shifted = side.numerator + (value - side.value) * side.denominator
+        terms += np.array([shifted, side.denominator]) * (total / (2 * side.denominator.sum()))
+    return Contribution(*terms, nominal=loud.nominal)
 
 
 def _task_weights(cell: UnpairedScores, indices: Iterable[int]) -> Floats:

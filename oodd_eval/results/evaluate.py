@@ -241,6 +241,7 @@ def cell_metrics(
     condition: str = "",
     rate: float | None = None,
     rows: bool = False,
+    supervised: bool = False,
     attribution: Callable[[GuaranteedAlarm], dict[str, Contribution]] = lambda _: {},
     draws: Mapping[str, NDArray[np.float64]] = MappingProxyType({}),
 ) -> tuple[dict[str, Metric], dict[str, Contribution]]:
@@ -258,6 +259,8 @@ def cell_metrics(
         Without twins, rows in a second; None leaves out alarms per hour.
     rows
         Without twins, whether metrics of rows are computed, too.
+    supervised
+        Without twins, whether the detector learns from failures.
     attribution
         Returns what explanations are worth at the alarms of the headline's level.
     draws
@@ -268,7 +271,7 @@ def cell_metrics(
     if isinstance(cell, PairedScores):
         terms |= cell_contributions(*cell, rules.paper)
     elif condition != str(NOMINAL):
-        terms |= unpaired.separability(cell, rules.calibration.unbounded)
+        terms |= unpaired.separability(cell, rules.calibration.unbounded, supervised=supervised)
     judged = cell
     if isinstance(cell, UnpairedScores) and rules.calibration.tail is not None:
         judged = cell.with_statistics(rules.calibration.joint)
@@ -555,6 +558,7 @@ def _with_metrics(
         "environment": record.environment,
         "draws": record.calibration_draws,
         "rate": data.logs.rate if data.logs else None,
+        "supervised": record.training == "failures",
     }
     if isinstance(cell, UnpairedScores):
         condition = str(record.condition)

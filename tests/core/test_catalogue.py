@@ -36,6 +36,7 @@ def test_the_names_of_a_level_are_those_of_its_metrics_their_nulls_and_the_thres
     own = ["early", "delay", "missed", "delay_censored", "found_within_20", "found_within_100"]
     expected = ["false_episodes", *(n for name in own for n in (name, f"{name}_null"))]
     expected += ["events_found", "false_alarms_per_hour", "found_outcome", "found_outcome_null"]
+    expected += ["balanced_outcome", "outcome_time"]
     assert list(GUARANTEED) == expected
     sets = [f"named_{of}{after}" for after in ("", "_20") for of in ("precision", "recall")]
     named = ["sensor_named", "onset_error", *sets, "named_chance", "named_largest", "kind_named"]
@@ -77,7 +78,7 @@ def test_better_sides():
     found = [n for n in NAMES if n.startswith("found") and "null" not in n]
     for name in ("auc", RANKING, "sensor_named_at_5pct", "named_recall_20_at_5pct", *found):
         assert metric_info(name).better == "higher"
-    for name in (ALARM_RANKING, "far", "missed", "onset_error_at_5pct"):
+    for name in (ALARM_RANKING, "far", "missed", "onset_error_at_5pct", "brier_outcome"):
         assert metric_info(name).better == "lower"
 
 
@@ -85,8 +86,10 @@ def test_metrics_without_twins_and_those_on_request():
     facts = {name: metric_info(name) for name in NAMES}
     assert {n for n in facts if facts[n].request} == {"f1_rows", "far_rows", "mar_rows", "vus_pr"}
     assert {n.partition("_at_")[0] for n in facts if facts[n].cells == "unpaired"} == {
-        "auc_pool", "auc_pool_null", "auc_rows", "auc_outcome", "f1_rows", "far_rows", "mar_rows",
-        "vus_pr", "events_found", "false_alarms_per_hour", "found_outcome", "found_outcome_null",
+        "auc_pool", "auc_pool_null", "auc_rows", "auc_outcome", "auc_outcome_half",
+        "auc_outcome_whole", "brier_outcome", "f1_rows", "far_rows", "mar_rows", "vus_pr",
+        "events_found", "false_alarms_per_hour", "found_outcome", "found_outcome_null",
+        "balanced_outcome", "outcome_time",
     }  # fmt: skip
     for name, info in facts.items():
         assert not info.null or facts[info.null].cells in (info.cells, "")
@@ -101,6 +104,7 @@ def test_kinds_of_intervals():
     assert {n for n in NAMES if not kinds[n]} == {f"threshold_{s}" for s in LEVELS}
     assert {n.partition("_at_")[0] for n in NAMES if kinds[n] == "mean"} == {
         "delay", "delay_null", "delay_censored", "delay_censored_null", "onset_error",
+        "outcome_time", "brier_outcome",
     }  # fmt: skip
 
 
