@@ -3,7 +3,11 @@
 import numpy as np
 import pytest
 from oodd_logs.importing import import_frames, import_recipe
+from oodd_logs.inspection.draft import draft_recipe
+from oodd_logs.inspection.logs import inspect_logs
+from oodd_logs.inspection.report import as_json, describe_logs
 from oodd_logs.recipe import Recipe
+from oodd_logs.scanning.logs import read_logs
 
 from oodd_eval.errors import TrajectoryError, UsageError
 
@@ -227,3 +231,80 @@ def test_columns_of_a_block_are_numbered_and_have_their_conversions_and_roles(fr
 def test_errors_of_blocks_say_what_to_do(frames, blocks, expected):
     with pytest.raises(UsageError, match=expected):
         frames(blocks=blocks)
+
+
+NAMES = {
+    "vel_innov", "gps_hpos_test_ratio", "r_residual", "chunk_mse", "chunk_error", "anomaly_score",
+    "NIS", "position uncertainty [m]", "recon_err", "OOD", "velInnov",
+}  # fmt: skip
+PLAIN = {
+    "innov_var", "innovation_variances", "error", "tracking error", "moose", "loss", "nisan",
+    "scoreboard", "speed", "std",
+}  # fmt: skip
+
+
+def write_table(path, columns, rows=60, seed=0):
+    rng = np.random.default_rng(seed)
+    table = [
+        ",".join(columns),
+        *(",".join(map(str, rng.normal(size=len(columns)))) for _ in range(rows)),
+    ]
+    path.write_text("\n".join(table) + "\n")
+
+
+def test_inspect_proposes_scores_by_their_names(tmp_path):
+    columns = sorted(NAMES | PLAIN)
+    for i in range(4):
+        write_table(tmp_path / f"r{i}.csv", columns, seed=i)
+    logs = inspect_logs(tmp_path)
+    recipe = draft_recipe(tmp_path)
+    assert {*recipe.scores} == {*logs.scores} == NAMES
+    assert {*recipe.sensors} == PLAIN
+    assert "by name what a monitor computed" in describe_logs(logs)
+    roles = {column["name"]: column["role"] for column in as_json(logs)["columns"]}
+    assert (roles["NIS"], roles["speed"]) == ("scores", "sensor")
+    source = import_recipe(recipe, tmp_path, tmp_path / "split")
+    with source.opened() as opened:
+        assert len(opened(recipe.environment).sensors) == len(PLAIN)
+
+
+def test_a_score_in_few_rows_without_values_and_of_an_angle_is_proposed_as_it_is(tmp_path):
+    cells = {
+        "speed": lambda t: np.sin(t / 9), "yaw_innov": lambda t: (t / 20 + 3.1) % 6.28 - 3.1,
+        "pos_innov": lambda t: t if t % 30 == 0 else "", "hgt_test_ratio": lambda t: 0,
+        "sonar_innov": lambda t: "",
+    }  # fmt: skip
+    for i in range(4):
+        rows = [",".join(str(cell(t)) for cell in cells.values()) for t in range(600)]
+        (tmp_path / f"r{i}.csv").write_text("\n".join([",".join(cells), *rows]) + "\n")
+    recipe = draft_recipe(tmp_path)
+    # What has no value, or one, is left out as other columns are.
+    assert recipe.scores == ("yaw_innov", "pos_innov")
+    assert (recipe.columns, recipe.missing, recipe.missing_rows) == ({}, "hold", 29)
+
+
+def test_scores_are_sensors_where_nothing_else_is_left(tmp_path):
+    for i in range(4):
+        write_table(tmp_path / f"r{i}.csv", ["vel_innov", "pos_innov"], seed=i)
+    recipe = draft_recipe(tmp_path)
+    assert (recipe.sensors, recipe.scores) == (("vel_innov", "pos_innov"), ())
+
+
+def test_prefixed_columns_are_scores_too(tmp_path):
+    for i in range(4):
+        write_table(tmp_path / f"r{i}.csv", ["obs:q[rad]", "obs:q_residual[rad]"], seed=i)
+    recipe = draft_recipe(tmp_path)
+    assert (recipe.sensors, recipe.scores) == ((), ("obs:q_residual[rad]",))
+    logs = read_logs(tmp_path)
+    assert [(q.name, q.role) for q in logs.sensors] == [("q", "measured"), ("q_residual", "score")]
+    assert logs.notes[0] == "sensors: q; scores: q_residual"
+    recipe = Recipe("s", "s", scores=("obs:*",), nominal=recipe.nominal)
+    with pytest.raises(UsageError, match="all columns are scores, expected a sensor"):
+        import_recipe(recipe, tmp_path, tmp_path / "split")
+
+
+def test_read_logs_has_all_columns_and_keeps_what_is_missing(tmp_path):
+    csv_logs(tmp_path, lambda i: [f"{i + row % 7},{row if row > 3 else ''}" for row in range(40)])
+    logs = read_logs(tmp_path)
+    assert [q.role for q in logs.sensors] == ["measured", "score"]
+    assert {episode.observations.shape for episode in logs.episodes} == {(36, 2)}

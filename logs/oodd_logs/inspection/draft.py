@@ -141,18 +141,21 @@ def _draft_columns(logs: Inspection) -> Iterator[str]:
         yield "]"
         yield '# actions = ["cmd*"]  # what was commanded, if columns say so'
         for name, role in logs.roles.items():
-            if role:
+            if role not in {"", "scores"}:
                 remarks[role_of(role).reason].append(name)
         for reason, names in remarks.items():
             yield from wrapper.wrap(f"left out, {reason}: {listed(names, 40)}")
+    if logs.scores:
+        yield "# by name what a monitor computed: no sensors, but columns that are kept"
+        yield f"scores = {_several(logs.scores)}"
     for name, members in logs.kinds.items():
         used = {names: value for names, value in members.items() if {*names} <= {*sensors}}
         if line := line_of(kinds()[name], used):
             yield line
         elif used:
             yield from wrapper.wrap(f"{name}: {listed([n for names in used for n in names], 40)}")
-    facts = {name: logs.columns[name] for name in sensors}
-    if "missing-code" in logs.kinds or any(lacks_values(n, facts[n]) for n in sensors):
+    facts = {name: logs.columns[name] for name in (*sensors, *logs.scores)}
+    if "missing-code" in logs.kinds or any(lacks_values(n, column) for n, column in facts.items()):
         most = max(max(column.longest, column.leading) for column in facts.values())
         yield 'missing = "hold"  # the last value; or "drop" rows, or "refuse"'
         if most > MISSING_ROWS:
@@ -227,7 +230,10 @@ def _globs(files: Sequence[str], names: Sequence[str], prefix: str) -> str:
         if name in left:
             globs.append(glob.escape(name))
             left.remove(name)
-    globs = [Path(prefix, pattern).as_posix() for pattern in globs]
-    if len(globs) < 4:
-        return toml(globs)
-    return "\n".join(["[", *(f"  {toml(pattern)}," for pattern in globs), "]"])
+    return _several([Path(prefix, pattern).as_posix() for pattern in globs])
+
+
+def _several(texts: Sequence[str]) -> str:
+    """Return texts as TOML, in several lines where they are many."""
+    lines = (f"  {toml(text)}," for text in texts)
+    return toml(texts) if len(texts) < 4 else "\n".join(["[", *lines, "]"])

@@ -61,6 +61,14 @@ _LABEL: Final = re.compile(
     r"|outlier|novelty|defect",
     re.IGNORECASE,
 )
+_SCORE: Final = re.compile(
+    r"innov|residual|test.?ratio|uncertain|disagreement|epistemic|mahalanobis|likelihood"
+    r"|(?:pred|recon|chunk|forecast|model)[a-z]*[^a-z]?err"
+    r"|(?:^|[^a-z])(?:scores?|mse|rmse|mae|mmd|nis|nees|nll|ood|novelty|surprise|entropy|chi2)"
+    r"(?:$|[^a-z])",
+    re.IGNORECASE,
+)
+_VARIANCE: Final = re.compile(r"variance|(?:^|[^a-z])var(?:$|[^a-z])", re.IGNORECASE)
 _DAY: Final = 86400  # seconds
 _Key = TypeVar("_Key")
 _Value = TypeVar("_Value")
@@ -275,16 +283,30 @@ class Inspection:
     @cached_property
     def kinds(self) -> Recognised:
         """Kinds of the columns of numbers that are no times or labels."""
-        excluded = {*self.times, *self.added.values(), *self.labels}
+        excluded = {*self.times, *self.added.values(), *self.labels, *self._scores}
         plain = {n: c for n, c in self.columns.items() if not (n in excluded or c.empty or c.text)}
         return recognise(plain)
 
     @cached_property
+    def _scores(self) -> set[str]:
+        """Columns of varying numbers that a monitor computed, by their names."""
+        excluded = {*self.times, *self.added.values(), *self.labels}
+        named = {n for n in self.columns if _SCORE.search(n) and not _VARIANCE.search(n)}
+        facts = ((name, self.columns[name]) for name in named - excluded)
+        return {n for n, c in facts if not (c.empty or c.text or c.constant or c.set_point)}
+
+    @cached_property
     def roles(self) -> dict[str, str]:
-        """Why columns are no sensors, by name: a role, or a kind; empty texts for sensors."""
+        """Why columns are no sensors, by name: a role, or a kind; empty texts for sensors.
+
+        Where only scores would be left, they are sensors: a monitor's column may be one.
+        """
         usable = (recording for recording in self.recordings if recording.file in self.usable)
         partial = {n for r in usable for n in self._lacking(r) & self._candidates}
-        return self._basic_roles | dict.fromkeys(partial, "partial")
+        roles = self._basic_roles | dict.fromkeys(partial, "partial")
+        if "" in roles.values():
+            return roles
+        return {name: role.replace("scores", "") for name, role in roles.items()}
 
     @cached_property
     def _basic_roles(self) -> dict[str, str]:
@@ -292,7 +314,7 @@ class Inspection:
         names_by_role = {"times": {*self.times, *self.added.values()}, "labels": {*self.labels}}
         # Stamps that rise, but stand still too often for times of rows.
         standing = {n for n, (falls, repeats) in self._stuck.items() if falls < 0.01 <= repeats}
-        names_by_role["standing"] = standing
+        names_by_role |= {"standing": standing, "scores": self._scores}
         of_kinds: dict[str, str] = {}
         together: set[str] = set()
         for kind, members in self.kinds.items():
@@ -323,7 +345,7 @@ class Inspection:
 
     @cached_property
     def _candidates(self) -> set[str]:
-        return {name for name, role in self._basic_roles.items() if not role}
+        return {name for name, role in self._basic_roles.items() if role in {"", "scores"}}
 
     @cached_property
     def usable(self) -> list[str]:
@@ -349,8 +371,13 @@ class Inspection:
     @cached_property
     def sensors(self) -> list[str]:
         """The columns that are sensors of a first recipe."""
-        named = [name for name in self.columns if name.startswith("obs:")]
+        named = [n for n in self.columns if n.startswith("obs:") and self.roles[n] != "scores"]
         return named or [name for name, role in self.roles.items() if not role]
+
+    @cached_property
+    def scores(self) -> list[str]:
+        """The columns that are scores of a first recipe."""
+        return [name for name, role in self.roles.items() if role == "scores"]
 
     def _names(self, topic: Topic, below: str, file: str) -> dict[str, str]:
         """Return the names of a topic's columns among all, which others may spell otherwise."""
@@ -407,6 +434,7 @@ class Inspection:
                 "times",
                 "_stuck",
                 "labels",
+                "_scores",
                 "kinds",
                 "_basic_roles",
                 "_candidates",
@@ -414,7 +442,7 @@ class Inspection:
             ):
                 self.__dict__.pop(name, None)
         for name, role in self.roles.items():
-            if role and role not in {"times", "labels"}:
+            if role and role not in {"times", "labels", "scores"}:
                 self.ledger.add("column", "dropped", role_of(role).reason, name=name)
         kept = functools.partial(self.ledger.add, "column", "kept")
         sensors = [name for name, role in self.roles.items() if not role]

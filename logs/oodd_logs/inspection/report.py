@@ -137,7 +137,7 @@ def _of_columns(logs: Inspection) -> Iterator[Advice]:
         if names and ROLES[role].advice:
             text = ROLES[role].advice.format(names=listed(names), first=toml(names[0]))
             yield Advice(role, text)
-    plain = {n: logs.columns[n] for n in roles if roles[n] in {"", "partial", "slow"}}
+    plain = {n: logs.columns[n] for n in roles if roles[n] in {"", "scores", "partial", "slow"}}
     if missing := {n: c.missing / c.cells for n, c in plain.items() if lacks_values(n, c)}:
         worst = max(missing, key=lambda name: missing[name])
         longest = max(plain[name].longest for name in missing)
@@ -152,7 +152,7 @@ def _of_columns(logs: Inspection) -> Iterator[Advice]:
         kind, names = kinds()[name], [n for together in members for n in together]
         text = kind.words.format(names=listed(names), line=line_of(kind, members))
         yield Advice(f"{name}s", text)
-    if coarse := [name for name, c in plain.items() if c.coarse]:
+    if coarse := [n for n, c in plain.items() if c.coarse and n not in logs.scores]:
         spread, mean = plain[coarse[0]].numbers.spread, plain[coarse[0]].numbers.mean
         text = (
             f"{listed(coarse)}: little change for the size ({coarse[0]}: {number(spread)} around "
