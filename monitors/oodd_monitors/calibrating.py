@@ -71,6 +71,9 @@ class Detections(NamedTuple):
         How many never alarm.
     delay
         Median of the rows from the beginning to the first alarm; NaN where none is known.
+    in_time
+        How many of the detected alarm in rows that every healthy episode has: longer episodes have
+        more time to alarm.
     """
 
     kind: str
@@ -79,6 +82,7 @@ class Detections(NamedTuple):
     detected: int
     missed: int
     delay: float
+    in_time: int
 
 
 class ScoreGroup(NamedTuple):
@@ -183,10 +187,11 @@ class ScoreCalibration:
     def notes(self) -> tuple[str, ...]:
         """What puts the promise in doubt, in sentences."""
         test = self.drift
+        grouped = " Groups that follow one another look alike." if self.groups else ""
         drift = (
             "The score drifts: its largest values follow the order of the logs (rank correlation "
             f"{test.statistic:.2f}, p = {test.p:.2g}), so that more logs than promised may alarm. "
-            "Calibrate on logs of the days that are judged, or on the newest alone."
+            f"Calibrate on logs of the days that are judged, or on the newest alone.{grouped}"
         )
         return (drift,) if test.significant else ()
 
@@ -338,7 +343,7 @@ def calibrate(
         calibration,
         false_alarms=sum(calibration.first(s) is not None for s in healthy),
         healthy=len(healthy),
-        detections=_detections(calibration, labelled),
+        detections=_detections(calibration, labelled, min(map(len, episodes))),
         groups=_groups(calibration, episodes, numbers, groups, options) if groups else {},
     )
 
@@ -371,14 +376,14 @@ def _checked(scores: Sequence[ArrayLike]) -> list[Floats]:
 
 def _check_enough(numbers: NDArray[np.intp], level: float, alarm: ScoreAlarm) -> None:
     """Raise `UsageError` where even windows of recordings are too few for a level."""
-    n, noun = len(numbers), "logs" if len({*numbers.tolist()}) == len(numbers) else "windows"
+    n, whole = len(numbers), len({*numbers.tolist()}) == len(numbers)
     kind: AlarmKind = "cusum" if alarm == "cusum" else "score"
     least = least_episodes(level, kind)
     if n >= least:
         return
+    few = counted(n, "healthy log(s)" if whole else "healthy window(s)")
     text = (
-        f"{n} healthy {noun} are too few for {100 * level:.3g} %: {_NAMES[alarm]} needs {least}, "
-        f"{least - n} more"
+        f"{few}, too few for {100 * level:.3g} %: {_NAMES[alarm]} needs {least}, {least - n} more"
     )
     allowed = n // 2 if kind == "cusum" else n
     if kind == "cusum" and n >= least_episodes(level, "score"):
@@ -439,20 +444,28 @@ def _longest_gap(scores: Floats) -> int:
 
 
 def _detections(
-    calibration: ScoreCalibration, labelled: Sequence[LabelledScores]
+    calibration: ScoreCalibration, labelled: Sequence[LabelledScores], shortest: int
 ) -> list[Detections]:
     """Return what a threshold detects, by kind."""
     rows = []
     for kind in dict.fromkeys(episode.kind for episode in labelled):
         episodes = [episode for episode in labelled if episode.kind == kind]
-        firsts = [calibration.first(episode.scores) for episode in episodes]
         starts = [e.intervals[0][0] if e.intervals else -1 for e in episodes]
-        pairs = [(f, s) for f, s in zip(firsts, starts, strict=True) if f is not None]
-        early = sum(first < start for first, start in pairs)
-        delays = [first - start for first, start in pairs if 0 <= start <= first]
-        delay = float(np.median(delays)) if delays else math.nan
-        missed = len(episodes) - len(pairs)
-        rows.append(Detections(kind, len(episodes), early, len(pairs) - early, missed, delay))
+        firsts = [calibration.first(episode.scores) for episode in episodes]
+        alarms = [(f, s) for f, s in zip(firsts, starts, strict=True) if f is not None]
+        detected = [(first, start) for first, start in alarms if first >= start]
+        delays = [first - start for first, start in detected if start >= 0]
+        rows.append(
+            Detections(
+                kind,
+                len(episodes),
+                len(alarms) - len(detected),
+                len(detected),
+                len(episodes) - len(alarms),
+                float(np.median(delays)) if delays else math.nan,
+                sum(first < shortest for first, _ in detected),
+            )
+        )
     return rows
 
 

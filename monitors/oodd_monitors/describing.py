@@ -99,7 +99,6 @@ def sentences(calibration: ScoreCalibration, name: str) -> Iterator[str]:
             f"({100 * alarms / n:.3g} %, 95 % interval {low:.2g} to {high:.3g})."
         )
     yield from map(_detected, calibration.detections)
-    yield from _by_group(calibration, name)
 
 
 def _upper(text: str) -> str:
@@ -134,25 +133,28 @@ def _levels(calibration: ScoreCalibration) -> Iterator[str]:
 
 def _detected(row: Detections) -> str:
     """Return what is detected of a kind."""
-    delay = (
-        f", {row.delay:g} rows after it began in the median" if not math.isnan(row.delay) else ""
-    )
-    early = f", {row.early} before it began" if row.early else ""
-    detected = f"{row.detected} alarm{delay}{early}, {row.missed} never"
-    return f"Of {row.episodes} with {row.kind}: {detected}."
+    text = f"Of {counted(row.episodes, 'log(s)')} with {row.kind}: {row.detected} alarm"
+    if not math.isnan(row.delay):
+        text += f" once it began, after {row.delay:g} rows in the median"
+    elif row.detected:
+        text += f", {row.in_time} of them before the shortest healthy log would end"
+    return f"{text}; {row.early} before it began; {row.missed} never."
 
 
-def _by_group(calibration: ScoreCalibration, name: str) -> Iterator[str]:
-    """Yield the threshold of each group, and what pooling does."""
+def by_group(calibration: ScoreCalibration, name: str, unit: str) -> Iterator[str]:
+    """Yield the threshold of each group, and what pooling does to it.
+
+    Parameters
+    ----------
+    calibration, name, unit
+        As of `condition`.
+    """
     for group, row in calibration.groups.items():
-        alone = row.problem
-        if row.calibration:
-            alone = condition(row.calibration, name)
-            alone += f" ({row.calibration.promise})" if row.calibration.needed else ""
+        line = condition(row.calibration, name, unit) if row.calibration else row.problem
         low, high = (100 * share for share in clopper_pearson(row.above, row.episodes))
         yield (
-            f"{group}: {alone}. At the pooled threshold {row.above} of its {row.episodes} healthy "
-            f"logs alarm (95 % interval {low:.2g} to {high:.3g} %)."
+            f"{group}: {line} (pooled, {row.above} of its {row.episodes} healthy logs alarm: "
+            f"{low:.2g} to {high:.3g} %)"
         )
 
 

@@ -217,8 +217,9 @@ def _notes(source: EpisodeSource, scores: RecordedScores, silent: Sequence[str])
     if silent:
         yield f"Left out, as the score has no value there: {listed(silent)}."
     dropped = [e for e in source.ledger if e.fate == "dropped" and e.item in {"file", "recording"}]
-    for entry in dropped:
-        yield f"Left out: {counted(entry.count, f'{entry.item}(s)')}, {entry.reason}."
+    if dropped:
+        count, first = sum(entry.count for entry in dropped), dropped[0]
+        yield f"Left out: {counted(count, 'log(s)')}, the first as {first.reason}"
 
 
 def _of_split(split: Split, column: ScoreColumn, per: str) -> RecordedScores:

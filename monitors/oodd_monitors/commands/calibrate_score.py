@@ -8,9 +8,10 @@ from oodd_logs.commands.reader_plugins import register_formats
 from oodd_eval.cli import COUNT, FILE, Name, Options, command
 from oodd_eval.cli.console import make_console
 from oodd_eval.data.bounded import without_nan
+from oodd_eval.errors import UsageError
 from oodd_eval.prose import print_prose
 from oodd_monitors.calibrating import calibrate
-from oodd_monitors.describing import as_json, condition, sentences
+from oodd_monitors.describing import as_json, by_group, condition, sentences
 from oodd_monitors.recorded_scores import read_scores
 
 _PERCENT = click.FloatRange(0, 100, min_open=True, max_open=True)
@@ -53,23 +54,28 @@ def calibrate_score(options: Options) -> int:
     """
     register_formats(options)
     scores = read_scores(options.logs, options.score, recipe=options.recipe, per=options.per)
-    calibration = calibrate(
-        scores.scores,
-        options.level / 100,
-        alarm=options.alarm,
-        hold=options.hold,
-        recordings=scores.recordings,
-        labelled=scores.labelled,
-        healthy=scores.healthy,
-        groups=scores.groups or None,
-    )
+    try:
+        calibration = calibrate(
+            scores.scores,
+            options.level / 100,
+            alarm=options.alarm,
+            hold=options.hold,
+            recordings=scores.recordings,
+            labelled=scores.labelled,
+            healthy=scores.healthy,
+            groups=scores.groups or None,
+        )
+    except UsageError as error:
+        raise UsageError(". ".join([str(error), *scores.notes])) from None
     name = options.score
     if options.json:
         content = as_json(calibration, name, scores.unit) | {"read": scores.notes}
         click.echo(json.dumps(without_nan(content), indent=1, allow_nan=False))
         return 0
     console = make_console()
-    console.print(condition(calibration, name, scores.unit), markup=False, highlight=False)
+    for line in by_group(calibration, name, scores.unit):
+        console.print(line)
+    console.print(condition(calibration, name, scores.unit))
     if options.verbosity >= 0:
         for text in (*sentences(calibration, name), *scores.notes):
             print_prose(text, console)
