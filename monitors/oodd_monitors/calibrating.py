@@ -428,12 +428,11 @@ def _statistic(scores: Floats, rule: GuaranteedAlarm, smoothing: float | None, h
     """Return what alarms are of: the least of the last `hold` rows that have a score."""
     present = ~np.isnan(scores)
     values = rule.statistic(_smoothed(scores[present], smoothing))
-    held = np.full(len(values), -math.inf)
-    if len(values) >= hold:
-        windows = np.lib.stride_tricks.sliding_window_view(values, hold)
-        held[hold - 1 :] = windows.min(axis=1)
+    if hold > 1 and len(values):
+        padded = np.concatenate([np.full(hold - 1, -math.inf), values])
+        values = np.lib.stride_tricks.sliding_window_view(padded, hold).min(axis=1)
     statistic = np.full(len(scores), -math.inf)
-    statistic[present] = held
+    statistic[present] = values
     return statistic
 
 

@@ -81,7 +81,7 @@ def sentences(calibration: ScoreCalibration, name: str) -> Iterator[str]:
     largest, share = calibration.sweep
     text = (
         f"A hand sweep until none of these {counted(n, 'log(s)')} trips stops at {largest:.6g}, "
-        f"and lets {100 * share:.3g} % (1/{n + 1}) of further healthy logs trip."
+        f"and lets {100 * share:.3g} % (1/{n + 1}) of further healthy logs trip on average."
     )
     if largest > 0:
         text += " A margin on top lets fewer trip: how many fewer, healthy logs do not tell."
@@ -138,7 +138,8 @@ def _detected(row: Detections) -> str:
         text += f" once it began, after {row.delay:g} rows in the median"
     elif row.detected:
         text += f", {row.in_time} of them before the shortest healthy log would end"
-    return f"{text}; {row.early} before it began; {row.missed} never."
+    early = f"; {row.early} before it began" if row.early else ""
+    return f"{text}{early}; {row.missed} never."
 
 
 def by_group(calibration: ScoreCalibration, name: str, unit: str) -> Iterator[str]:

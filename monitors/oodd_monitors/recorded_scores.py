@@ -17,6 +17,7 @@ from oodd_logs.readers import in_order
 from oodd_logs.recipe import Recipe
 from oodd_logs.selecting import split_unit
 
+from oodd_eval.data.facts import Quantity
 from oodd_eval.data.layout import MANIFEST
 from oodd_eval.data.parts import (
     CALIBRATION,
@@ -27,7 +28,7 @@ from oodd_eval.data.parts import (
     TrajectorySet,
 )
 from oodd_eval.data.split import Split, load_split
-from oodd_eval.errors import TrajectoryError, UnknownNameError, UsageError
+from oodd_eval.errors import TrajectoryError, UsageError
 from oodd_eval.names import counted, listed
 from oodd_monitors.calibrating import LabelledScores
 
@@ -139,10 +140,10 @@ def read_scores(
 def _of_logs(path: Path, column: ScoreColumn, recipe_file: Path | None, per: str) -> RecordedScores:
     """Read a column of logs."""
     recipe, root, files = _recipe_and_files(path, recipe_file)
-    renamed = (t for t in recipe.sensors if split_unit(t.partition("=")[0])[0] == column.name)
     recipe = replace(
         recipe,
-        sensors=(next((text for text in renamed if "=" in text), column.name),),
+        sensors=_texts_of(recipe, column.name),
+        scores=(),
         actions=(),
         reward="",
         discrete=0,
@@ -153,12 +154,19 @@ def _of_logs(path: Path, column: ScoreColumn, recipe_file: Path | None, per: str
     try:
         with read_every_episode(recipe, root, files) as source:
             return _of_episodes(source, column, recipe.baseline, per)
-    except UnknownNameError:
-        raise
     except TrajectoryError as error:
-        raise UsageError(
-            f"{error}. A score is a column of numbers: `oodd-eval data inspect` lists them"
-        ) from None
+        advice = "A score is a column of numbers: `oodd-eval data inspect` lists them"
+        raise UsageError(f"{error}. {advice}") from None
+
+
+def _texts_of(recipe: Recipe, name: str) -> tuple[str, ...]:
+    """Return what a recipe's sensors have to be so that the column of a name is among them."""
+    block = re.sub(r"\[\d+\]$", "", name)
+    if block in recipe.blocks:
+        return recipe.blocks[block]
+    texts = (text for text in (*recipe.sensors, *recipe.scores) if "=" in text)
+    renamed = (text for text in texts if split_unit(text.partition("=")[0])[0] == name)
+    return (next(renamed, name),)
 
 
 def _recipe_and_files(path: Path, recipe_file: Path | None) -> tuple[Recipe, Path, list[Path]]:
@@ -188,12 +196,10 @@ def _of_episodes(
     source: EpisodeSource, column: ScoreColumn, baseline: int, per: str
 ) -> RecordedScores:
     """Return the scores of the episodes of logs."""
-    if len(source.sensors) > 1:
-        names = [sensor.name for sensor in source.sensors]
-        raise UsageError(f"{column.name!r} names {len(names)} columns ({listed(names)}): name one")
-    result, silent, groups = RecordedScores(source.sensors[0].unit), [], set()
+    number = _number_of(column.name, source.sensors)
+    result, silent = RecordedScores(source.sensors[number].unit), []
     for i, episode in enumerate(source.episodes(EVERY)):
-        scores = column(episode.observations[:, 0].copy(), baseline)
+        scores = column(episode.observations[:, number].copy(), baseline)
         if np.isnan(scores).all():
             silent.append(episode.name)
         elif episode.kind or episode.intervals:
@@ -203,11 +209,18 @@ def _of_episodes(
             result.scores.append(scores)
             result.recordings.append(i if episode.recording is None else episode.recording)
             result.groups += [episode.task] if per else []
-            groups.add(episode.task)
-    if per and groups <= {""}:
+    if per and {*result.groups} <= {""}:
         raise UsageError(f"no healthy log has a field or column {per!r}, which --per names")
     result.notes += _notes(source, result, silent)
     return result
+
+
+def _number_of(name: str, sensors: Sequence[Quantity]) -> int:
+    """Return the number of the column of a name, or of the only one that a glob names."""
+    names = [sensor.name for sensor in sensors]
+    if name not in names and len(names) > 1:
+        raise UsageError(f"{name!r} names {len(names)} columns ({listed(names)}): name one")
+    return names.index(name) if name in names else 0
 
 
 def _notes(source: EpisodeSource, scores: RecordedScores, silent: Sequence[str]) -> Iterator[str]:
@@ -219,7 +232,7 @@ def _notes(source: EpisodeSource, scores: RecordedScores, silent: Sequence[str])
     dropped = [e for e in source.ledger if e.fate == "dropped" and e.item in {"file", "recording"}]
     if dropped:
         count, first = sum(entry.count for entry in dropped), dropped[0]
-        yield f"Left out: {counted(count, 'log(s)')}, the first as {first.reason}"
+        yield f"Left out: {counted(count, 'log(s)')}, the first as {first.reason}."
 
 
 def _of_split(split: Split, column: ScoreColumn, per: str) -> RecordedScores:
@@ -231,10 +244,7 @@ def _of_split(split: Split, column: ScoreColumn, per: str) -> RecordedScores:
         raise UsageError(f"--per {per}: a split keeps no field but the task, so --per task")
     whole = split.environment(split.environments[0])
     data = whole.of_columns([column.name])
-    if len(data.sensors) > 1:
-        names = listed([sensor.name for sensor in data.sensors])
-        raise UsageError(f"{column.name!r} names {len(data.sensors)} columns ({names}): name one")
-    result = RecordedScores(data.sensors[0].unit)
+    result = RecordedScores(data.sensors[_number_of(column.name, data.sensors)].unit)
     for part, episodes in ((TRAIN, data.train), (CALIBRATION, data.calibration)):
         recordings = data.recordings(part) or [(part, i) for i in range(len(episodes))]
         result.scores += _scores_in(data, column, episodes)

@@ -66,7 +66,7 @@ def calibrate_score(options: Options) -> int:
             groups=scores.groups or None,
         )
     except UsageError as error:
-        raise UsageError(". ".join([str(error), *scores.notes])) from None
+        raise UsageError(" ".join([f"{error}.", *scores.notes]).removesuffix(".")) from None
     name = options.score
     if options.json:
         content = as_json(calibration, name, scores.unit) | {"read": scores.notes}
