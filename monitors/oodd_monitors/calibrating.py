@@ -180,8 +180,8 @@ class ScoreCalibration:
         """The promise on false alarms as a sentence."""
         if text := self.calibration.no_promise(self.level):
             return text
-        noun = "logs" if self.whole else "windows of further logs"
-        return f"at most {100 * self.level:.3g} % of further healthy {noun} alarm"
+        noun = "further healthy logs" if self.whole else "windows of further healthy logs"
+        return f"at most {100 * self.level:.3g} % of {noun} alarm"
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -352,11 +352,10 @@ def _checked(scores: Sequence[ArrayLike]) -> list[Floats]:
     """Return the scores of episodes as arrays; `UsageError` where they are no score."""
     episodes = [as_numbers(s, f"episode {i} of the scores: ") for i, s in enumerate(scores)]
     for i, values in enumerate(episodes):
-        if values.ndim != 1 or np.isnan(values).all():
-            raise UsageError(
-                f"episode {i} has scores of shape {values.shape}, expected one a row, some of them "
-                "numbers: leave it out where nothing was scored"
-            )
+        if values.ndim != 1:
+            raise UsageError(f"episode {i} has scores of shape {values.shape}, expected one a row")
+        if np.isnan(values).all():
+            raise UsageError(f"episode {i} has no score: leave it out, or correct its log")
     pooled = np.concatenate([np.zeros(0), *episodes])
     values = np.unique(pooled[~np.isnan(pooled)]).tolist()
     if len(values) == 1:
@@ -396,7 +395,7 @@ def _check_enough(numbers: NDArray[np.intp], level: float, alarm: ScoreAlarm) ->
 
 _NAMES: Final[Mapping[str, str]] = {
     "threshold": "a threshold",
-    "cusum": "a CUSUM, which half of them standardize,",
+    "cusum": "a CUSUM, half of which scale it,",
     "ewma": "a weighted mean",
 }
 

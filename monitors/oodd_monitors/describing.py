@@ -68,7 +68,8 @@ def sentences(calibration: ScoreCalibration, name: str) -> Iterator[str]:
         Sentences, in the order in which they are read.
     """
     yield from _formula(calibration, name)
-    yield f"{_upper(calibration.promise)}."
+    whole = "" if calibration.whole else " Logs that no window cuts would promise it of whole logs."
+    yield f"{_upper(calibration.promise)}.{whole}"
     n, kind = calibration.units, calibration.calibration.kind
     if interval := calibration.share_interval:
         low, high = (100 * share for share in interval)

@@ -34,6 +34,8 @@ from oodd_monitors.calibrating import LabelledScores
 
 Floats = NDArray[np.float64]
 
+_NEVER: Final = 1e11
+"""Seconds of a gap that no recording has: none cuts a recording of scores, whose topic is slow."""
 _SIGNED: Final = re.compile(r"(-?)(?:\|(?P<a>.+)\||abs\((?P<b>.+)\)|(?P<c>.+))")
 
 
@@ -147,6 +149,7 @@ def _of_logs(path: Path, column: ScoreColumn, recipe_file: Path | None, per: str
         actions=(),
         reward="",
         discrete=0,
+        gap=_NEVER,
         roles={},
         columns={k: codes for k, codes in recipe.columns.items() if k == MISSING_CODES},
         task=per or recipe.task,
@@ -173,23 +176,32 @@ def _recipe_and_files(path: Path, recipe_file: Path | None) -> tuple[Recipe, Pat
     """Return how logs are read, the folder that files are relative to, and the files."""
     if recipe_file or path.suffix == ".toml":
         recipe = Recipe.load(recipe_file or path)
-        root = path if path.is_dir() else path.parent
-        matched = dict.fromkeys(files_of(recipe, root))
-        if isinstance(recipe.intervals, str):
-            matched.pop(root / recipe.intervals, None)
+        roots = dict.fromkeys([path if path.is_dir() else path.parent])
+        roots |= {recipe_file.parent: None} if recipe_file else {}
+        root, matched = next(
+            ((root, files) for root in roots if (files := _files_of(recipe, root))), (path, [])
+        )
         if not matched:
             raise UsageError(
                 f"no file in {str(root)!r} matches {listed(recipe.globs)} of the recipe: say which "
                 "folder they are in, as in calibrate FOLDER --recipe FILE"
             )
-        return recipe, root, sorted(matched, key=lambda file: in_order(file.as_posix()))
+        return recipe, root, matched
     logs = inspect_logs(path)
     recipe = Recipe.parse(tomllib.loads(draft(logs)))
-    recipe = replace(recipe, window=0, rate=None, nominal=replace(recipe.nominal, window=None))
+    recipe = replace(recipe, window=0, rate=None)
     files = recognised(path, recipe.format)[1]
     root = path if path.is_dir() and files != [path] else path.parent
     copies = {root / name for same in logs.equal for name in same[1:]} | {root / logs.intervals}
     return recipe, root, [file for file in files if file not in copies]
+
+
+def _files_of(recipe: Recipe, root: Path) -> list[Path]:
+    """Return the files of recordings that a recipe lists, in natural order."""
+    files = {*files_of(recipe, root)}
+    if isinstance(recipe.intervals, str):
+        files.discard(root / recipe.intervals)
+    return sorted(files, key=lambda file: in_order(file.as_posix()))
 
 
 def _of_episodes(
