@@ -49,6 +49,7 @@ NOT_RUN = [
     Rule(
         r"^rm -rf dist$|^python -m build$|\.ci/check-dist", "test_packaging builds and tries both"
     ),
+    Rule(r"^python -m twine |^pip index ", "need distributions or an index; test_packaging checks"),
     Rule(r"^(mkdir|cp) ", "moves what a command of PARSED_ONLY would have made"),
     Rule(r"^(dask |dask-)", "servers that stay; test_executors starts them"),
     Rule(r"^python docs/figures/make\.py$", "test_figures_are_what_the_script_draws runs it"),

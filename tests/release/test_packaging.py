@@ -16,6 +16,8 @@ import pytest
 from helpers_wheel import pip
 from trove_classifiers import classifiers, deprecated_classifiers
 
+from oodd_eval._version import repository
+
 pytestmark = pytest.mark.packaging
 
 ROOT = Path(__file__).parents[2]
@@ -110,10 +112,28 @@ def test_metadata_say_what_the_project_says(distributions):
 
 
 def test_the_index_takes_both_distributions(distributions):
-    """Their metadata are valid, and the readme renders as it does on the page of a project."""
+    """Their metadata are valid; of a readme in Markdown twine reads no more than the type."""
     pytest.importorskip("twine", reason="it is among the dependencies of development (extra dev)")
     said = run(sys.executable, "-m", "twine", "--no-color", "check", "--strict", *distributions)
     assert said.count("PASSED") == 2
+
+
+def test_the_readme_renders_as_on_the_page_of_an_index():
+    """Its tables, code and links are what they are in the repository."""
+    reason = "it is among the dependencies of development (extra dev)"
+    pytest.importorskip("comrak", reason=reason)  # without it the next one renders no Markdown
+    markdown = pytest.importorskip("readme_renderer.markdown", reason=reason)
+    readme = (ROOT / "README.md").read_text()
+    page = markdown.render(readme)
+    prose = re.sub(r"^```.*?^```$", "", readme, flags=re.MULTILINE | re.DOTALL)
+    assert page.count("<table>") == len(re.findall(r"^\|[-|]+\|$", readme, re.MULTILINE)) > 0
+    assert page.count("<pre") == readme.count("\n```") // 2 > 0
+    targets = re.findall(r"\]\(([^)\s]+)\)", prose)
+    assert [*re.findall(r'(?:href|src)="([^#"][^"]*)"', page)] == targets
+    assert not re.search(r"<!--|&lt;!--|\|---", page)
+    if repository():
+        # A page of an index shows no file of the repository.
+        assert not [target for target in targets if not target.startswith("https://")]
 
 
 def test_wheel_is_at_most_30_megabytes(wheel):
