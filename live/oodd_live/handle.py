@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from oodd_eval.data.baseline import Baseline, undefined
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import ContractError, UsageError
-from oodd_eval.metrics.alarms import STATISTICS, AlarmKind
+from oodd_eval.metrics.alarms import RECORDED, STATISTICS, AlarmKind
 from oodd_eval.names import read, whole_number
 from oodd_eval.plugins.contract import (
     AnyDetector,
@@ -20,6 +20,7 @@ from oodd_eval.plugins.contract import (
     StorableDetector,
     StreamingDetector,
     factory_of,
+    fit_detector,
     float_scores,
     make_detector,
 )
@@ -40,13 +41,19 @@ def has_actions(episodes: Iterable[Trajectory]) -> bool:
     return bool(widths) and 0 not in widths
 
 
+def columns_of(detector: AnyDetector) -> tuple[str, ...]:
+    """Return the columns that a named detector is handed; none where it is handed the sensors."""
+    return discover().offer(detector).spec.columns if isinstance(detector, str) else ()
+
+
 @dataclass(frozen=True, slots=True)
 class DetectorHandle:
     """A detector, with what it takes to make it again.
 
-    `alarm` is the statistic of its alarms, `actions` tells whether it gets actions, and `adapts`
-    whether it learns from baseline rows by itself. `state` has JSON values that `from_state` reads;
-    its name is empty for a class, a function or an instance that was passed in.
+    `alarm` is the statistic of its alarms, `actions` tells whether it gets actions, `adapts`
+    whether it learns from baseline rows by itself, and `supervised` whether it learns from failed
+    episodes. `state` has JSON values that `from_state` reads; its name is empty for a class, a
+    function or an instance that was passed in.
     """
 
     detector: Detector
@@ -54,6 +61,7 @@ class DetectorHandle:
     actions: bool
     adapts: bool
     state: Mapping[str, Any]
+    supervised: bool = False
 
     @classmethod
     def make(
@@ -79,7 +87,7 @@ class DetectorHandle:
         if kind is None and statistic is not None:
             expected = ", ".join(map(repr, STATISTICS))
             raise UsageError(f"statistic={statistic!r}, expected one of {expected}")
-        name, looks_at_actions, adapts = "", True, False
+        name, looks_at_actions, adapts, supervised = "", True, False, False
         if isinstance(detector, str):
             plugins = discover()
             offer = plugins.offer(detector)
@@ -98,13 +106,36 @@ class DetectorHandle:
             )
             kind, name = kind or spec.alarm, spec.name
             looks_at_actions = spec.inputs != "observations"
+            supervised = spec.training == "failures"
         elif isinstance(detector, type) or not isinstance(detector, Detector):
             factory = factory_of(detector)
             detector = make_detector(factory, seed=seed, horizon=horizon, parameters=parameters)
         state: dict[str, Any] = {"name": name, "statistic": kind or "cusum"}
         state |= {"seed": seed, "horizon": horizon}
         state |= {"parameters": dict(parameters), "baseline": baseline, "roles": [*roles]}
-        return cls(detector, kind or "cusum", looks_at_actions, adapts, state)
+        return cls(detector, kind or "cusum", looks_at_actions, adapts, state, supervised)
+
+    def fit(
+        self,
+        nominal: Iterable[Trajectory],
+        base: Baseline | None = None,
+        failures: Iterable[Trajectory] | None = None,
+    ) -> None:
+        """Fit the detector on what it may see; a supervised one takes failed episodes, too.
+
+        `UsageError` where it lacks these, or a named one learns from nominal episodes alone.
+        """
+        name = self.state["name"]
+        if self.supervised and failures is None:
+            raise UsageError(
+                f"{name} learns from failed episodes, too: Watchdog.fit takes failures=, or an "
+                "environment of logs imported with failures = 0.5"
+            )
+        if name and failures is not None and not self.supervised:
+            raise UsageError(f"{name} learns from nominal episodes alone: leave out failures")
+        visible = [self.visible(x, base) for x in nominal]
+        failed = None if failures is None else [self.visible(x, base) for x in failures]
+        fit_detector(self.detector, visible, failures=failed)
 
     def visible(self, trajectory: Trajectory, base: Baseline | None = None) -> Trajectory:
         """Return what the detector may see of an episode: all rows if it learns from the first."""
@@ -143,7 +174,7 @@ class DetectorHandle:
             )
         return cls.make(
             detector or state["name"],
-            state["statistic"],
+            None if state["statistic"] in RECORDED else state["statistic"],
             int(state["seed"]),
             int(state["horizon"]),
             state["parameters"],

@@ -9,9 +9,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from oodd_eval.arrays import as_numbers
 from oodd_eval.data.baseline import Baseline, check_baseline, episode_means
-from oodd_eval.data.facts import roles_of
+from oodd_eval.data.facts import Quantity, roles_of
 from oodd_eval.data.offsets import fit_offsets
-from oodd_eval.data.parts import CALIBRATION, TRAIN, TWINS, EnvironmentData
+from oodd_eval.data.parts import CALIBRATION, TRAIN, TWINS, EnvironmentData, columns_named
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import TrajectoryError, UsageError
 from oodd_eval.metrics.promise import EpisodeMeans, PromiseFinding, promises
@@ -87,6 +87,8 @@ class NominalData:
         For each calibration episode the recording that it is a window of; None where each is one.
     other_recordings
         Those of the training episodes and of the further ones.
+    failures
+        Failed episodes; None without any.
     """
 
     train: list[Trajectory]
@@ -97,6 +99,7 @@ class NominalData:
     recorded: bool
     recordings: Sequence[Hashable] | None = None
     other_recordings: Sequence[Sequence[Hashable] | None] = (None, None)
+    failures: list[Trajectory] | None = None
 
     @classmethod
     def of(
@@ -109,8 +112,13 @@ class NominalData:
         baseline: int | None,
         rate: float | None,
         recordings: Sequence[Hashable] | None = None,
+        failures: Sequence[Episode] | None = None,
+        columns: Sequence[str] = (),
     ) -> Self:
-        """Take the arguments of `Watchdog.fit`; what is None is a split's own, if it has it."""
+        """Take the arguments of `Watchdog.fit`; what is None is a split's own, if it has it.
+
+        Episodes have the `columns` in place of the sensors, if there are any.
+        """
         further: list[Trajectory] = []
         recorded = True
         others: Sequence[Sequence[Hashable] | None] = (None, None)
@@ -121,7 +129,9 @@ class NominalData:
                     "calibration episodes beside an environment of a split, expected none: it has "
                     "its own; hand over its train to use others"
                 )
-            data, facts = train, train.logs
+            data = train.of_columns(columns) if columns else train
+            columns, facts = (), data.logs
+            failures = data.failures if failures is None else failures
             train, calibration, sensors = data.train, data.calibration, sensors or data.sensors
             recordings = data.recordings(CALIBRATION) if recordings is None else recordings
             others = data.recordings(TRAIN), data.recordings(TWINS)
@@ -139,18 +149,31 @@ class NominalData:
         rows = 0 if baseline is None else baseline
         if isinstance(rows, bool) or not isinstance(rows, int) or rows < 0:
             raise UsageError(f"baseline={baseline!r}, expected a number of rows")
-        raw = [_raw(x) for x in train], [_raw(x) for x in calibration]
+        raw = [[_raw(x) for x in part] for part in (train, calibration, failures or ())]
         arrays = [x[0] for x in raw[0] if not isinstance(x, Trajectory)]
         widths = [(x.observations if isinstance(x, Trajectory) else x[0]).shape[1] for x in raw[0]]
         width = widths[0] if widths else 0
-        subtracted = _offsets(offsets, arrays, width)
-        training, calibrating = ([_trajectory(x, subtracted) for x in part] for part in raw)
+        # A recorded score is judged as it is.
+        subtracted = _offsets([0.0] * width if columns and not offsets else offsets, arrays, width)
+        parts = [[_trajectory(x, subtracted) for x in part] for part in raw]
         names = sensor_names(sensors, width)
+        if columns:
+            named = [Quantity(name, "") for name in names]
+            numbers = [i for c in columns for i in columns_named(named, c, "the episodes")]
+            names, subtracted = [names[i] for i in numbers], subtracted[numbers]
+            sensors = sensors and [sensors[i] for i in numbers]
+            parts = [
+                [Trajectory(x.observations[:, numbers], x.actions) for x in part] for part in parts
+            ]
+        training, calibrating, failed = parts
         if rows:
             check_baseline(map(len, calibrating), rows, "calibration")
         base = Baseline.fit(training, rows) if rows else None
         nominal = Nominal(names, subtracted, base, roles_of(sensors or ()), actions)
-        return cls(training, calibrating, further, nominal, rate, recorded, recordings, others)
+        return cls(
+            training, calibrating, further, nominal, rate, recorded, recordings, others,
+            failed or None,
+        )  # fmt: skip
 
     def findings(self) -> list[PromiseFinding]:
         """Return what was tested about the promise."""

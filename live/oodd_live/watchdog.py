@@ -22,24 +22,25 @@ from oodd_eval.errors import (
     UsageError,
 )
 from oodd_eval.metrics.alarms import (
+    RECORDED,
     AlarmKind,
     Calibration,
     GuaranteedAlarm,
-    Monitor,
     joined,
     least_episodes,
     too_few,
 )
 from oodd_eval.metrics.cusum import Standardization
-from oodd_eval.metrics.faults import ParetoTail, StreamScale, readings
+from oodd_eval.metrics.faults import KINDS, ParetoTail, StreamScale, readings
 from oodd_eval.names import check_known, counted
 from oodd_eval.plugins.contract import AnyDetector, StorableDetector, copied
 from oodd_eval.plugins.explanations import Explanation, checked_naming, naming_of
 from oodd_eval.plugins.state import pack, read_state, take, write_state
 from oodd_eval.plugins.voices import VoiceCosts, costs_of_voices
-from oodd_live.handle import DetectorHandle, has_actions, streaming
+from oodd_live.handle import DetectorHandle, columns_of, has_actions, streaming
 from oodd_live.nominal import Episode, Nominal, NominalData
 from oodd_live.reading import EpisodeAlarm, Reading, RunLength
+from oodd_live.scores import SCORE, ScoreMonitor, ScoreStream, longest_gap
 from oodd_live.stream import OBSERVATION, Stream
 
 KIND: Final = "watchdog/4"
@@ -49,17 +50,26 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """The arguments of `Watchdog.fit` that operation and promise need."""
+    """The arguments of `Watchdog.fit` that operation and promise need, or facts of a score.
+
+    Of a score's statistic these are `smoothing` and `hold`, see `ScoreMonitor`, and the longest gap
+    between scores in healthy episodes; None for a detector's.
+    """
 
     alpha: float
     confidence: float | None
     rate: float | None
     latch: bool
     hold_off: int
+    smoothing: float | None = None
+    hold: int = 1
+    longest_gap: int | None = None
 
 
 class Watchdog:
-    """A fitted detector with a threshold, fed one observation at a time; made by `fit` or `load`.
+    """A fitted detector with a threshold, fed one observation at a time.
+
+    It is made by `fit`, by `of_scores` for the scores of a monitor, or by `load`.
 
     An alarm is raised when the statistic exceeds the threshold: that of the scores, or the one that
     is as rare as the faults of the sensors. Nothing that a sensor sends is an exception.
@@ -89,7 +99,7 @@ class Watchdog:
         calibration: Calibration | None,
         rule: GuaranteedAlarm,
         tail: ParetoTail,
-        stream: StreamScale,
+        stream: StreamScale | None,
         rest: Floats,
         nominal: Nominal,
         settings: Settings,
@@ -101,14 +111,19 @@ class Watchdog:
         self._nominal, self.sensors = nominal, list(nominal.sensors)
         self.settings, self.run_length, self.notes = settings, run_length, list(notes)
         self.voices: VoiceCosts | None = None
-        self._live = streaming(handle.detector)
-        self._explain_last = getattr(self._live, "explain_last", None)
+        live: Any = streaming(handle.detector)
+        self._explain_last = getattr(live, "explain_last", None)
         # Actuators that the detector sees: by number without names, or with those of sensors.
         names = enumerate(nominal.actions or [""] * len(rest))
         actuators = [n if n not in {"", *self.sensors} else f"actuator {j}" for j, n in names]
         self._parts = [*self.sensors, *actuators] if handle.actions else self.sensors
         commands = rest if handle.actions else ()
-        self._stream = Stream(stream, commands, settings.rate, nominal.baseline)
+        self._stream: Any
+        if stream is None:
+            self._stream = live = ScoreStream(settings.longest_gap or 0)
+        else:
+            self._stream = Stream(stream, commands, settings.rate, nominal.baseline)
+        self._live = live
         # Rows at the start that are not judged, and rows that the detector is not shown.
         self._rows = nominal.baseline.rows if nominal.baseline else 0
         self._hidden = 0 if handle.adapts else self._rows
@@ -129,6 +144,7 @@ class Watchdog:
         baseline: int | None = None,
         offsets: Sequence[float] | None = None,
         recordings: Sequence[Hashable] | None = None,
+        failures: Sequence[Episode] | None = None,
         latch: bool = True,
         hold_off: int = 0,
         statistic: str | None = None,
@@ -147,6 +163,8 @@ class Watchdog:
             ``"panel"`` is `panel-a` where training episodes have actions, which `update` is then
             handed, too; ``parameters={"actions": "no"}`` leaves them out. Without ``update`` a
             detector scores the whole episode so far at every row, which a warning says.
+            ``"column:NAME"`` and others that name columns are handed these alone, which are the
+            watchdog's `sensors` then; of what happens to a recorded number only gaps are faults.
         train, calibration
             Nominal episodes to fit on, and others for the threshold, both in the order in which
             they were recorded: `Trajectory` objects, observations of shape (T + 1, D), or tuples of
@@ -174,6 +192,9 @@ class Watchdog:
             For each calibration episode the recording that it is a window of, such as its file; an
             environment of a split knows them. Windows of one recording count once, and too few
             recordings promise nothing.
+        failures
+            Failed episodes, for a detector that learns from them; an environment of a split may
+            have some.
         latch
             Whether an alarm stays until `acknowledge`, and not only as long as its cause.
         hold_off
@@ -203,6 +224,8 @@ class Watchdog:
             baseline=baseline,
             rate=rate,
             recordings=recordings,
+            failures=failures,
+            columns=columns_of(detector),
         )
         nominal = data.nominal
         rows = nominal.baseline.rows if nominal.baseline else 0
@@ -218,12 +241,19 @@ class Watchdog:
         )
         settings = Settings(alpha, confidence, data.rate, latch, hold_off)
         if hours is not None:
-            _check_hours(hours, settings)
+            _check_hours(hours, settings, handle.alarm)
         training, calibrating = data.train, data.calibration
         _check_shares(settings)
         _check_enough(len(calibrating), settings, handle.alarm, hours)
-        handle.detector.fit([handle.visible(x, nominal.baseline) for x in training])
+        failed = data.failures if failures or handle.supervised else None
+        handle.fit(training, nominal.baseline, failed)
         stream = StreamScale.of_episodes(training, calibrating, nominal.baseline)
+        if handle.alarm in RECORDED:
+            # A monitor's number may stand still or go far: that is what it says.
+            others, tails = np.array(KINDS) != "missing", stream.tails
+            tails = tails._replace(start=np.where(others, math.inf, tails.start))
+            per_unit = np.where(others[:-1, None], 0.0, stream.per_unit)
+            stream = replace(stream, per_unit=per_unit, tails=tails)
         rest = np.concatenate([x.actions for x in training]).mean(axis=0, dtype=np.float64)
         faults = [
             stream.without(i).surprise(*readings(x, nominal.baseline))
@@ -237,12 +267,14 @@ class Watchdog:
                 warnings.warn(finding.text, PromiseWarning, stacklevel=2)
         if hours is None:
             largest = [float(surprise.max()) for surprise in faults]
-            fitted = Calibration.fit(scores, handle.alarm, data.recordings, largest)
+            joining = None if handle.alarm in RECORDED else largest
+            fitted = Calibration.fit(scores, handle.alarm, data.recordings, joining)
             if text := fitted.no_promise(alpha, confidence):
                 warnings.warn(text, PromiseWarning, stacklevel=2)
                 notes.insert(0, text)
             rule = fitted.rule(alpha, confidence)
-            tail = fitted.tail or ParetoTail.fit(fitted.largest)
+            # Missing flags alarm, too, where no flag of the calibration is up.
+            tail = fitted.tail or ParetoTail.fit(fitted.largest, float(handle.alarm == "flag"))
             watchdog = cls(handle, fitted, rule, tail, stream, rest, nominal, settings, None, notes)
             visible = (handle.visible(x, nominal.baseline) for x in calibrating)
             start = rows if handle.adapts else 0
@@ -253,15 +285,87 @@ class Watchdog:
         rule, tail, length = _with_run_length(scores, faults, handle.alarm, hours, rate)
         return cls(handle, None, rule, tail, stream, rest, nominal, settings, length, notes)
 
+    @classmethod
+    def of_scores(
+        cls,
+        calibration: Any,
+        alpha: float | None = None,
+        *,
+        confidence: float | None = None,
+        latch: bool = True,
+        hold_off: int = 0,
+    ) -> Self:
+        """Watch the scores that a monitor computes: no detector is needed.
+
+        `update` takes one number a row, NaN or None where there is none. A gap that is longer than
+        any in the calibration is a fault that alarms, too. `replay` and `explain` take arrays of
+        scores.
+
+        Parameters
+        ----------
+        calibration : ScoreCalibration, or sequence of arrays of shape (T + 1,)
+            Of `oodd_eval.calibrate`, whose statistic, smoothing and hold apply; or the scores of
+            healthy episodes in recorded order, NaN where there is none.
+        alpha
+            Largest share of nominal episodes whose scores raise an alarm; default the level of the
+            calibration, 0.05 for arrays.
+        confidence, latch, hold_off
+            As for `fit`.
+
+        Returns
+        -------
+        Watchdog
+
+        Raises
+        ------
+        UsageError
+            When the episodes are too few for the promise, or an argument is wrong.
+
+        Examples
+        --------
+        >>> healthy = [[0.1, peak, 0.2] for peak in range(1, 20)]
+        >>> watchdog = Watchdog.of_scores(healthy)
+        >>> watchdog.promise
+        'at most 5 % of nominal episodes raise an alarm, at most 1 of 20 by a gap of more than 0 \
+rows without a score'
+        >>> print(watchdog.update(19.0), watchdog.update(19.5), sep="; ")
+        row 0: nominal; row 1: alarm
+        """
+        if hasattr(calibration, "longest_gap"):
+            fitted, alpha = calibration.calibration, alpha or calibration.level
+            facts = calibration.smoothing, calibration.hold, calibration.longest_gap
+        else:
+            scores = [as_numbers(x, f"episode {i}: ") for i, x in enumerate(calibration)]
+            fitted, alpha = Calibration.fit(scores, "column"), alpha or 0.05
+            facts = None, 1, max(map(longest_gap, scores), default=0)
+        settings = Settings(alpha, confidence, None, latch, hold_off, *facts)
+        _check_shares(settings)
+        _check_enough(fitted.episodes, settings, fitted.kind, None)
+        handle = DetectorHandle.make(
+            f"column:{SCORE}", "cusum" if fitted.kind == "cusum" else None, 0, 1, {}
+        )
+        notes = [*filter(None, [fitted.no_promise(alpha, confidence)])]
+        nominal = Nominal([SCORE], np.zeros(1), None)
+        parts = ParetoTail.fit(fitted.largest), None, np.zeros(0), nominal, settings, None, notes
+        return cls(handle, fitted, fitted.rule(alpha, confidence), *parts)
+
     @property
     def promise(self) -> str:
         """The promise on false alarms as a sentence."""
         if (r := self.run_length) is None:
             alpha, confidence = self.settings.alpha, self.settings.confidence
+            if self.calibration and self.calibration.kind == "flag":
+                n = len(self.calibration.largest)
+                up = sum(x > self.rule.threshold for x in self.calibration.largest)
+                return f"nothing is promised: the flag is up in {up} of {n} calibration episodes"
             if self.calibration and (text := self.calibration.no_promise(alpha, confidence)):
                 return text
             sure = f", with {100 * confidence:.3g} % confidence" if confidence else ""
-            return f"at most {100 * alpha:.3g} % of nominal episodes raise an alarm{sure}"
+            gaps = ""
+            if self.calibration and (longest := self.settings.longest_gap) is not None:
+                more = f"a gap of more than {longest} rows without a score"
+                gaps = f", at most 1 of {self.calibration.recording_count + 1} by {more}"
+            return f"at most {100 * alpha:.3g} % of nominal episodes raise an alarm{sure}{gaps}"
         interval = f"95 % interval {r.low:.3g} to {r.high:.3g} h"
         beyond = "" if r.hours <= r.observed else ", by the shape of the tail"
         return (
@@ -278,7 +382,8 @@ class Watchdog:
     def reset(self) -> None:
         """Begin a new episode, without an alarm."""
         self._live.reset()
-        self._monitor, self._whole = Monitor(self.rule), Monitor(self.rule)
+        how = self.settings.smoothing, self.settings.hold
+        self._monitor, self._whole = (ScoreMonitor(self.rule, *how) for _ in range(2))
         self._stream.reset()
         self._t = -1
         self._largest = -math.inf
@@ -312,6 +417,9 @@ class Watchdog:
             )
         joined = self.calibration.joined(self._largest)
         self.rule, self.calibration = joined.rule(self.settings.alpha), joined
+        if self._scale is None:
+            self._stream.most = max(self._stream.most, self._stream.longest)
+            self.settings = replace(self.settings, longest_gap=self._stream.most)
         self.reset()
 
     def acknowledge(self) -> None:
@@ -335,10 +443,11 @@ class Watchdog:
 
         Parameters
         ----------
-        observation : array of shape (D,), mapping or None
+        observation : array of shape (D,), mapping, number or None
             The newest readings as the sensors send them, or readings by sensor. Offsets of the
             split are subtracted; `replay` takes its episodes, of which they are already. NaN,
             infinite, masked or absent: no reading came from that sensor in time; None: from none.
+            The score, of a watchdog of scores.
         action : array of shape (A,), optional
             Commanded since the row before; None at the first row.
         time, acted
@@ -368,13 +477,14 @@ class Watchdog:
             observation = [observation.get(name, math.nan) for name in self.sensors]
         return self._judged(self._measured(observation), action, time, acted)
 
-    def replay(self, episode: Trajectory) -> list[Reading]:
+    def replay(self, episode: Trajectory | ArrayLike) -> list[Reading]:
         """Judge a recorded episode of a split from its first row on.
 
         Parameters
         ----------
         episode
-            Observations of shape (T + 1, D) as a split has them: its offsets are subtracted.
+            Observations of shape (T + 1, D) as a split has them: its offsets are subtracted. Or
+            scores, an array of shape (T + 1,).
 
         Returns
         -------
@@ -386,6 +496,9 @@ class Watchdog:
         TrajectoryError
             For what is no `Trajectory`.
         """
+        if self._scale is None:
+            self.reset()
+            return [self.update(score) for score in as_numbers(episode)]
         if not isinstance(episode, Trajectory):
             raise TrajectoryError(
                 f"the episode is a {type(episode).__name__}, expected a Trajectory, such as "
@@ -395,7 +508,7 @@ class Watchdog:
         rows = zip(episode.observations, [None, *episode.actions], strict=True)
         return [self._judged(row, action, None, None) for row, action in rows]
 
-    def explain(self, episode: Trajectory) -> list[EpisodeAlarm]:
+    def explain(self, episode: Trajectory | ArrayLike) -> list[EpisodeAlarm]:
         """Return where a recorded episode alarms, which sensors are at fault, and since when.
 
         An alarm lasts as long as its cause here, whatever `latch` says. A copy of the watchdog
@@ -455,7 +568,8 @@ class Watchdog:
         value = -math.inf
         if self._stream.surprise:
             value = float(self._tail.value(self._stream.surprise))
-        self._largest = max(self._largest, self._whole.statistic, value)
+        if math.isfinite(self._stream.surprise):
+            self._largest = max(self._largest, self._whole.statistic, value)
         self._faults = {}
         if value > self.rule.threshold:
             self._faults = self._stream.faults(self._tail, self.rule.threshold)
@@ -570,6 +684,7 @@ class Watchdog:
                 "rolling": calibration.rolling,
                 "recordings": calibration.recordings,
                 "recording_count": calibration.recording_count,
+                "joint": calibration.tail is not None,
             },
             "tail": list(self._tail),
             "run_length": self.run_length and list(astuple(self.run_length)),
@@ -579,7 +694,7 @@ class Watchdog:
         state = {
             "kind": KIND,
             "watchdog": values,
-            **self._scale.arrays(),
+            **(self._scale.arrays() if self._scale else {}),
             "rest": self._rest,
             **self._nominal.arrays(),
             **self._handle.fitted(),
@@ -622,14 +737,16 @@ class Watchdog:
     @classmethod
     def _of(cls, state: Mapping[str, Any], detector: AnyDetector | None) -> Self:
         """Return the watchdog that all this was written of."""
-        values, stream = state["watchdog"], StreamScale.of(state)
+        values = state["watchdog"]
+        setting_values = values["settings"]
+        longest = setting_values.get("longest_gap")
+        stream = StreamScale.of(state) if longest is None else None
         tail = ParetoTail(*map(_finite, values["tail"]))
         rest = take(state, "rest", (None,))
         handle = DetectorHandle.from_state(values["made"], detector)
         names = [str(name) for name in values["sensors"]]
-        if not isinstance(handle.detector, StorableDetector) or len(names) != len(
-            stream.limits.mean
-        ):
+        width = len(stream.limits.mean) if stream else 1
+        if not isinstance(handle.detector, StorableDetector) or len(names) != width:
             raise FittedStateError(f"it does not fit {type(handle.detector).__name__}")
         nominal = Nominal.of(state, names, int(values["made"]["baseline"]))
         nominal = replace(nominal, actions=tuple(map(str, values.get("actions", ()))))
@@ -645,15 +762,17 @@ class Watchdog:
             tuple(map(int, calibration_values["recordings"])),
             int(calibration_values["recording_count"]),
             bool(calibration_values["rolling"]),
-            tail,
+            tail if calibration_values.get("joint", True) else None,
         )
-        setting_values = values["settings"]
         settings = Settings(
             alpha=_finite(setting_values["alpha"]),
             confidence=setting_values["confidence"] and _finite(setting_values["confidence"]),
             rate=setting_values["rate"] and _finite(setting_values["rate"]),
             latch=bool(setting_values["latch"]),
             hold_off=int(setting_values["hold_off"]),
+            smoothing=setting_values.get("smoothing") and _finite(setting_values["smoothing"]),
+            hold=int(setting_values.get("hold", 1)),
+            longest_gap=None if longest is None else int(longest),
         )
         rule = GuaranteedAlarm(standardization, _finite(values["threshold"]))
         length = length and RunLength(*map(_finite, length))
@@ -669,8 +788,10 @@ def _finite(value: float) -> float:
     return float(value)
 
 
-def _check_hours(hours: float, settings: Settings) -> None:
+def _check_hours(hours: float, settings: Settings, kind: AlarmKind) -> None:
     """Raise `UsageError` unless a mean time between false alarms can be promised."""
+    if kind == "flag":
+        raise UsageError(f"hours={hours!r}: a flag is an alarm already, expected none")
     if not (hours > 0 and settings.rate):
         raise UsageError(
             f"hours={hours!r} and rate={settings.rate!r}: a mean time between false alarms needs "
@@ -694,7 +815,7 @@ def _check_shares(settings: Settings) -> None:
 def _check_enough(episodes: int, settings: Settings, kind: AlarmKind, hours: float | None) -> None:
     """Raise `UsageError` when there are too few calibration episodes for the promise."""
     alpha, confidence = settings.alpha, settings.confidence
-    least = least_episodes(alpha, kind, confidence) if hours is None else 1
+    least = 1 if hours is not None or kind == "flag" else least_episodes(alpha, kind, confidence)
     if episodes < least:
         raise UsageError(too_few(f"alpha={alpha!r}", episodes, alpha, kind, confidence))
 
