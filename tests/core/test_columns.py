@@ -2,6 +2,7 @@
 
 import json
 import re
+import threading
 import zlib
 from contextlib import closing
 from dataclasses import replace
@@ -23,16 +24,17 @@ from helpers_plugins import install
 from oodd_eval import DetectorSpec, evaluate, load_split
 from oodd_eval.cli.main import main
 from oodd_eval.data.description import describe
-from oodd_eval.errors import PromiseWarning, UnknownNameError, UsageError
+from oodd_eval.errors import MissingExtraError, PromiseWarning, UnknownNameError, UsageError
 from oodd_eval.plugins.discovery import discover
 from oodd_eval.plugins.isolation.child import Limits
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.tables import unpromised
 from oodd_eval.scoring.doubts import doubts_after, doubts_before
-from oodd_eval.scoring.executors import RunSettings
+from oodd_eval.scoring.executors import Executor, RunSettings
 from oodd_eval.scoring.plan import make_plan, make_unit
 from oodd_eval.scoring.runner import run
+from oodd_eval.scoring.unit import UnitJob
 
 NAMES = [column.name for column in (*SENSORS, *SCORES)]
 
@@ -568,3 +570,18 @@ def test_in_this_process_failures_go_to_a_spec_that_declares_them(scored, parts,
         kept = ResultsDirectory(out).scores(record.scores, lengths)
         assert {float(s) for scores in kept.parts["calibration"] for s in scores} == {value}
         assert record.training == ("failures" if detector is spec else "nominal")
+
+
+@pytest.mark.parametrize("name", ["block", "column:pos_innov[1]"])
+def test_on_another_machine_a_unit_gets_the_same_columns_and_failures(failing, scored, name):
+    remote = pytest.importorskip("oodd_eval.scoring.executors.dask", exc_type=MissingExtraError)
+    plan = _plan(scored, name)
+    with closing(scored.environment("arm")) as data:
+        job = UnitJob(plan, plan.units[0], data, discover().offer(name))
+        order = json.loads(json.dumps(remote.order_of(job, scored, Limits())))
+        there = remote.run_order(order, threading.Event().is_set)
+        here = Executor(RunSettings(jobs=1), None, threading.Event())(job)
+    remote._environment.cache_clear()
+    assert there["status"] == here.status == "ok"
+    for part, arrays in here.file.parts.items():
+        assert [x.tolist() for x in there["parts"][part]] == [x.tolist() for x in arrays]

@@ -155,6 +155,27 @@ KNOWN = {
         "rules": {r"--seeds 2": "--seeds 2 --level 50"},
     },
     "examples/oodd-inspect-robots/README.md": {"folders": ["examples/oodd-inspect-robots"]},
+    "detectors/columns/README.md": {
+        "files": {
+            "flights.toml": "```toml",
+            "make.py": """
+                from pathlib import Path
+
+                import numpy as np
+
+                rng = np.random.default_rng(0)
+                Path("logs").mkdir()
+                for i in range(50):
+                    fault = (np.arange(60) > 30) * (i >= 45)
+                    innovation = rng.normal(size=60) + 9 * fault
+                    columns = rng.normal(size=60), innovation, 1 * (innovation > 4), fault
+                    lines = [",".join(map(str, row)) for row in zip(*columns, strict=True)]
+                    text = "\\n".join(["height,vel_innov,tripped,fault", *lines])
+                    Path("logs", f"{i:02}.csv").write_text(text)
+            """,
+        },
+        "before": ["python -m make"],
+    },
     # The other two train networks for a minute.
     "detectors/rivals/README.md": {"rules": {r"(?<=pca,knn,deedee),rnd,paano": ""}},
     "detectors/rivals/networks.md": {"rules": {r"(--detector \S+)": r"\1 --param updates=20"}},

@@ -31,7 +31,7 @@ def oodd_detector_from_spec(spec: str) -> DetectorSpec | None:
     match = _NAMED.fullmatch(text)
     name = match and (match["a"] or match["b"] or match["c"])
     signs = "NAME" if kind == "flag" else "NAME, -NAME or abs(NAME)"
-    if not match or not name or not re.fullmatch(COLUMN_NAME, name):
+    if not match or not name or not re.fullmatch(COLUMN_NAME, name, re.ASCII):
         raise UsageError(
             f"{spec!r:.200} names no column: expected {kind}:{signs}, with a NAME of letters, "
             "digits, blanks and any of -_+./%()[]; import the logs with scores or sensors of such "
