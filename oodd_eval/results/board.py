@@ -99,6 +99,8 @@ class Board:
         10 % where more rows have that.
     ranking, alarm_ranking
         Names of the metrics that rows are ordered and ranked by.
+    supervised
+        Rows that learn from failures: a band of their own below the others, never ranked with them.
     """
 
     def __init__(self, records: Sequence[Record], expected: Collection[Position] = ()) -> None:
@@ -109,6 +111,7 @@ class Board:
         self.paired = self.conditions.paired
         self.level = level_of(self.records)
         self.ranking, self.alarm_ranking = ranked_by(self.records)
+        self.supervised = supervised(self.records)
         self._rows = grouped(self.records, lambda r: r.setting)
         self._cells: dict[Setting, dict[Position, list[int]]] = {}  # indices of a row's records
         for row, of_row in self._rows.items():
@@ -253,6 +256,11 @@ class Board:
         failed = [r for r in self.records if not r.ok]
         units = {(r.cell.label, r.environment, r.status): r for r in reversed(failed)}
         return list(reversed(units.values()))
+
+
+def supervised(records: Iterable[Record]) -> set[Setting]:
+    """Return the rows that learn from failures."""
+    return {r.setting for r in records if r.training == "failures"}
 
 
 def ranked_by(records: Sequence[Record]) -> tuple[str, str]:

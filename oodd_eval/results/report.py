@@ -11,7 +11,7 @@ from oodd_eval.metrics.catalogue import HEADLINE, LEVELS, METRICS, NAMES, UNDEFI
 from oodd_eval.names import counted
 from oodd_eval.prose import Section, Table, terminal_text
 from oodd_eval.results import tables
-from oodd_eval.results.board import Board, boards, grouped
+from oodd_eval.results.board import Board, boards, grouped, supervised
 from oodd_eval.results.comparison import MEANINGS, By, Comparison, Difference
 from oodd_eval.results.record import Record
 from oodd_eval.results.standings import verdict_of
@@ -159,6 +159,7 @@ def findings_of(board: Board, level: str = "") -> list[str]:
         *tables.withheld(board),
         *tables.findings(board),
         *tables.phase_findings(board),
+        *tables.outcome_findings(board),
         *(tables.missing_level(board, level or HEADLINE) if bare else ()),
     ]
 
@@ -166,9 +167,11 @@ def findings_of(board: Board, level: str = "") -> list[str]:
 def flat(records: Sequence[Record]) -> list[dict[str, Any]]:
     """Return a flat mapping for each cell: its identity, its metrics, and its cost.
 
-    Every mapping has the metrics of all records, NaN where a cell lacks one.
+    Every mapping has the metrics of all records, NaN where a cell lacks one. What rows learn from
+    is in it where some learn from failures.
     """
     names = (
+        *(["training"] if supervised(records) else []),
         "split",
         "environment",
         "anomaly",

@@ -13,7 +13,7 @@ from oodd_eval.metrics.bootstrap import nan_mean
 from oodd_eval.metrics.catalogue import LEVELS, RANKING, metric_info
 from oodd_eval.metrics.ranking import Position, Row, differences
 from oodd_eval.names import counted
-from oodd_eval.results.board import Board, Conditions, contribution, ranked_by
+from oodd_eval.results.board import Board, Conditions, contribution, ranked_by, supervised
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
 
@@ -57,6 +57,8 @@ class PairedComparison:
         Cells that both rows have, over which the means are.
     environments
         Those of these cells.
+    note
+        Which row learns from failures, where the other does not; empty otherwise.
     """
 
     first: str
@@ -69,10 +71,11 @@ class PairedComparison:
     p: float
     cells: int
     environments: Sequence[str] = ()
+    note: str = ""
 
     @property
     def verdict(self) -> str:
-        """One sentence: which row is better and by how much, or that no difference is shown."""
+        """One sentence, and the note: which row is better, or that no difference is shown."""
         info = metric_info(self.metric)
         sign = -1 if (self.difference < 0) != (info.better == "lower") else 1
         rows = (self.first, self.second)[::sign]
@@ -81,12 +84,12 @@ class PairedComparison:
         ends = (turn * self.low, turn * self.high)[:: int(turn)]
         amount, low, high = map(info.text, (abs(self.difference), *ends))
         unit = {"percent": " points", "steps": " steps"}.get(info.unit, "")
-        scope = f"in {info.phrase} {in_words(self.environments)}".rstrip()
+        scope, end = f"in {info.phrase} {in_words(self.environments)}".rstrip(), f".{self.note}"
         if ends[0] > 0:
-            return f"{rows[0]} beats {rows[1]} by {amount}{unit} [{low}, {high}] {scope}."
+            return f"{rows[0]} beats {rows[1]} by {amount}{unit} [{low}, {high}] {scope}{end}"
         return (
             f"No difference is shown between {rows[0]} and {rows[1]} {scope}: "
-            f"{amount}{unit} [{low}, {high}], p = {self.p:.2g}."
+            f"{amount}{unit} [{low}, {high}], p = {self.p:.2g}{end}"
         )
 
     def __str__(self) -> str:
@@ -182,14 +185,16 @@ def compare_rows(
     values = tuple(sign * mean for mean in means)
     over = in_order((environment for environment, _ in common), ENVIRONMENTS)
     figures = sign * test.difference, low, high, test.p, len(common)
-    return PairedComparison(test.first, test.second, metric, values, *figures, over)
+    knowing = [*supervised(records) & {*settings}]
+    note = f" {knowing[0]} learns from failures, the other does not." if len(knowing) == 1 else ""
+    return PairedComparison(test.first, test.second, metric, values, *figures, over, note)
 
 
 def verdict_of(board: Board, level: str = "") -> str:
     """Return the sentence that comes first: the best row against the second, or what one row does.
 
     Rows that have no value in every cell, or know more than nominal trajectories, are passed over
-    where others are left.
+    where others are left. Rows that learn from failures are never compared with others.
 
     Parameters
     ----------
@@ -206,6 +211,7 @@ def verdict_of(board: Board, level: str = "") -> str:
     over = board.environments, board.anomalies
     means = {entry: board.mean(entry, *over, board.ranking) for entry in board.entries}
     defined = [entry for entry, mean in means.items() if not math.isnan(mean.value)]
+    defined = [entry for entry in defined if entry not in board.supervised] or defined
     knowing = {r.setting for r in board.records if r.training != "nominal"}
     eligible = [e for e in defined if not means[e].partial and e not in knowing]
     rows = sorted(eligible if len(eligible) > 1 else defined, key=lambda e: -means[e].value)

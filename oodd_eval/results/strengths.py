@@ -23,7 +23,7 @@ from oodd_eval.prose import Table
 from oodd_eval.results.board import Board, Column
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
-from oodd_eval.results.tables import best_first, show_value, unranked
+from oodd_eval.results.tables import best_first, marked, show_value, unranked
 
 DETECTION: Final = f"found_within_{FOUND_WITHIN[-1]}_{HEADLINE}"
 """The metric whose share decides: found within 100 rows, where 5 % of nominal episodes alarm."""
@@ -369,7 +369,7 @@ class StrengthTables:
         """Return the metric that ranks by strength."""
         texts = self._by_strength(order, self.board.ranking)
         title = metric_info(self.board.ranking).title
-        rows = [[str(e), *texts[e]] for e in order]
+        rows = [[marked(self.board, e), *texts[e]] for e in order]
         header, note = ["detector", *self.strengths.names], _COLUMNS[self.strengths.base]
         return Table(f"{title[0].upper()}{title[1:]} (%) by strength", header, rows, note=note)
 

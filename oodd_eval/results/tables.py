@@ -14,6 +14,7 @@ from oodd_eval.metrics.alarms import missing_level as _too_few
 from oodd_eval.metrics.alarms import no_promise, offered_levels
 from oodd_eval.metrics.bootstrap import nan_mean
 from oodd_eval.metrics.catalogue import PAPER, UNDEFINED, metric_info
+from oodd_eval.metrics.unpaired import OUTCOME_UP_TO
 from oodd_eval.names import counted
 from oodd_eval.plugins.contract import training_mark
 from oodd_eval.prose import Table
@@ -26,6 +27,9 @@ BRIEF: Final = "\N{DAGGER}"
 
 UNPROMISED: Final = "\N{DOUBLE DAGGER}"
 """Marks columns of alarms whose level too few recordings promise nothing at."""
+
+SUPERVISED: Final = "\N{SECTION SIGN}"
+"""Marks rows that learn from failures, which stand below the others."""
 
 
 def show_value(value: Value, metric: str) -> str:
@@ -40,6 +44,11 @@ def show_value(value: Value, metric: str) -> str:
     if not math.isnan(value.low):
         text += f" [{number(value.low)}, {number(value.high)}]"
     return text + "*" * value.partial + BRIEF * value.brief
+
+
+def marked(board: Board, entry: Setting) -> str:
+    """Return a row's name with the mark of its band."""
+    return f"{entry}{f' {SUPERVISED}' * (entry in board.supervised)}"
 
 
 def texts(board: Board, entry: Setting, columns: Iterable[Column]) -> list[str]:
@@ -94,6 +103,15 @@ POOLED: Final = ("auc_pool", "auc_pool_null", "auc_rows")
 OUTCOME: Final = "auc_outcome"
 """Metric of episodes that are known by their outcome alone."""
 
+WHOLE: Final = "auc_outcome_whole"
+"""The same of whole episodes, whose length alone tells failures."""
+
+BRIER: Final = "brier_outcome"
+"""Metric of rows that learn from failures and say probabilities."""
+
+ALARMS_OF_OUTCOMES: Final = tuple(name for name in catalogue.GUARANTEED if "outcome" in name)
+"""Metrics of alarms of such episodes, without the suffix of a level."""
+
 WORST: Final = "worst environment"
 """Heading of the column that has the environment in which a row is worst."""
 
@@ -129,6 +147,10 @@ class Tables:
     labels: Mapping[Setting, Sequence[str]] = field(default_factory=dict)
     label_names: Sequence[str] = ("detector",)
     level: str = ""
+
+    def label(self, entry: Setting) -> Sequence[str]:
+        """Return the texts before a row's figures."""
+        return self.labels.get(entry, [marked(self.board, entry)])
 
     def headline(self) -> Table | None:
         """Return the columns that stand first everywhere, a row per detector.
@@ -215,7 +237,7 @@ class Tables:
         names = [column.metric for column in columns]
         hours, *censored = self._at_level("false_alarms_per_hour", "delay_censored")
         hourly = f"{metric_info(hours).noun}, " * (hours in names)
-        steps = "delays in steps, " * any(name.startswith("delay") for name in names)
+        steps = "delays in steps, " * any(metric_info(name).unit == "steps" for name in names)
         units = f"{steps}{hourly}the rest in %" if steps or hourly else "%"
         note = _joined(self._promise(columns), CENSORED * ({*censored} <= {*names}))
         title = f"Guaranteed alarms at {percent_of(self.suffix)} ({units})"
@@ -227,7 +249,7 @@ class Tables:
         means = {entry: board.seed_means(entry, metric) for entry in self.order}
         info = metric_info(metric)
         rows = [
-            [*self.labels.get(e, [str(e)]), str(len(m)), *map(info.text, (min(m), max(m)))]
+            [*self.label(e), str(len(m)), *map(info.text, (min(m), max(m)))]
             for e, m in means.items()
             if len(m) > 1
         ]
@@ -256,7 +278,7 @@ class Tables:
         """Return every metric without an alarm, mean over all cells, with nulls and the placebo."""
         usual = [n for n, info in catalogue.METRICS.items() if info.cells != "unpaired"]
         infos = map(metric_info, self.board.present(catalogue.METRICS) or usual)
-        printed = [info for info in infos if not info.request and not info.paper]
+        printed = [i for i in infos if i.unit == "percent" and not i.request and not i.paper]
         columns = [Column(info.name, info.title, intervals=self.intervals) for info in printed]
         return self.table("All metrics of separability (%), mean over cells", columns)
 
@@ -343,10 +365,11 @@ class Tables:
         """Return what is found of episodes known by their outcome alone; None without any."""
         if not self._present([OUTCOME]):
             return None
-        names = [OUTCOME, *self._at_level("found_outcome", "found_outcome_null")]
+        names = [*OUTCOME_UP_TO, *self._at_level(*ALARMS_OF_OUTCOMES), BRIER]
         if self._alarms() is None:
             names += [*POOLED, *self._at_level(*_NOMINAL)]
-        note = self._outcome_note()
+        brier = {_heading(name): name for name in self._present([BRIER])}
+        note = _joined(self._outcome_note(), explained(brier))
         return self._of_logs("Episodes known by their outcome alone (%)", names, note=note)
 
     def _outcome_note(self) -> str:
@@ -431,23 +454,25 @@ class Tables:
     ) -> Table:
         """Return columns with a row per detector, by default all in the order of the tables."""
         rows = entries or self.order
-        cells = [[*self.labels.get(e, [str(e)]), *texts(self.board, e, columns)] for e in rows]
+        cells = [[*self.label(e), *texts(self.board, e, columns)] for e in rows]
         lacking = [_unpromised(self.board, c) for c in columns]
         marks = (UNPROMISED if sentences else "" for sentences in lacking)
         header = [*self.label_names, *(c.title + m for c, m in zip(columns, marks, strict=True))]
         promises = dict.fromkeys(itertools.chain(*lacking))
-        note = _joined(note, *promises, *reasons(self.board, rows, columns))
+        band = _BAND * any(e in self.board.supervised and e not in self.labels for e in rows)
+        note = _joined(note, *promises, band, *reasons(self.board, rows, columns))
         return Table(title, header, cells, len(self.label_names), note, wrap=not self.board.paired)
 
 
 _TABLE_5: Final = ("auc", "delay", "far")
 _FIRST: Final = (f"found_within_{catalogue.FOUND_WITHIN[0]}", "missed", "false_episodes")
-_OUTCOMES: Final = ("found_outcome", "false_episodes")
+_OUTCOMES: Final = ("found_outcome", "balanced_outcome", "false_episodes")
 _SAME_ROW: Final = "Episodes are compared up to the same row, as failures run into the time limit."
 _FIXED: Final = (
     "Detector seeds are fixed: intervals are over test episodes and calibration episodes, and say "
     "nothing of further seeds."
 )
+_BAND: Final = f"{SUPERVISED} trained on failures: a band of its own, below the others."
 _NOMINAL: Final = ("false_episodes", "false_alarms_per_hour")
 _PUBLISHED: Final = "Metrics of rows, for comparison with published tables; they rank nothing"
 _ATTRIBUTION: Final = (
@@ -471,16 +496,18 @@ def best_first(board: Board) -> list[Setting]:
     """Return the rows of a board by their mean of the metric that ranks them, the best first.
 
     Where no record has it, as in some graded suites, the share that is found decides. Rows without
-    a value in some expected cell come last.
+    a value in some expected cell come last, and below them in the same order those that learn from
+    failures.
     """
     share_found = f"found_within_{catalogue.FOUND_WITHIN[-1]}_{board.level}"
     metric = share_found if board.leaves_out([board.ranking]) else board.ranking
     means = {entry: board.of(entry, Column(metric)) for entry in board.entries}
 
-    def order(entry: Setting) -> tuple[bool, float, str]:
+    def order(entry: Setting) -> tuple[bool, bool, float, str]:
         mean = means[entry]
         undefined = math.isnan(mean.value)
-        return undefined or mean.partial, 0.0 if undefined else -mean.value, str(entry)
+        value = 0.0 if undefined else -mean.value
+        return entry in board.supervised, undefined or mean.partial, value, str(entry)
 
     return sorted(means, key=order)
 
@@ -587,11 +614,12 @@ def findings(board: Board) -> list[str]:
     """Return a sentence where a simple row has a higher mean than detectors: matched AUC or AUC.
 
     The AUC of what knows the time alone is left out: the clock's is 1 by construction.
-    Without twins it is the metric that ranks.
+    Without twins it is the metric that ranks, and on outcomes `outcome_findings` has the clock.
     """
     sentences = []
     for simple in (e for e in board.entries if e.detector in _SIMPLE):
-        metrics = [board.ranking]
+        timed = simple.detector == CLOCK and board.ranking == OUTCOME and board.present([WHOLE])
+        metrics = [] if timed else [board.ranking]
         metrics += ["auc"] * (board.paired and simple.detector not in BLIND)
         for info in map(metric_info, metrics):
             below = []
@@ -600,11 +628,17 @@ def findings(board: Board) -> list[str]:
                 if simple.horizon == entry.horizon and not same_kind:
                     value, lower = board.compare(simple, entry, info.name)
                     if value > lower:
-                        below.append(f"{entry} ({info.text(lower)} against {info.text(value)})")
+                        below.append(_against(board, entry, info.text(lower), info.text(value)))
             if below:
                 than = _listed(below, "rows")
                 sentences.append(f"{simple} has a higher mean {info.title} than {than}.")
     return sentences
+
+
+def _against(board: Board, entry: Setting, value: str, simple: str) -> str:
+    """Return a row with its figure and that of a simple row."""
+    band = ", trained on failures" * (entry in board.supervised)
+    return f"{entry}{band} ({value} against {simple})"
 
 
 def phase_findings(board: Board) -> list[str]:
@@ -614,27 +648,50 @@ def phase_findings(board: Board) -> list[str]:
     phase either, and environments whose episodes have no phase that they share: their pooled AUC
     compares rows of all numbers, where that of the clock is not one half by ties alone.
     """
-    info = metric_info("auc_rows")
     sentences = []
     for clock in (entry for entry in board.entries if entry.detector == CLOCK):
         pooled = {e: board.of(clock, Column(POOLED[0], "", [e])) for e in board.environments}
-        records = [r for r in board.records if pooled[r.environment].value == 0.5]
-        if not records:
-            continue
-        part, listed = Board(records), []
-        for entry in (e for e in part.entries if e.detector not in _SENSELESS):
-            phase, value = part.compare(clock, entry, info.name)
-            mean = part.of(entry, Column(info.name, intervals=True))
-            if phase >= value and not mean.low <= 0.5 <= mean.high:
-                listed.append(f"{entry} ({info.text(value)} against {info.text(phase)})")
-        if listed:
-            sentences.append(
-                f"{clock}, which knows the time alone, is as good as or better than these rows in "
-                f"{info.title}, which then is the phase of the episode, not the dynamics: "
-                f"{', '.join(listed)}."
-            )
+        if records := [r for r in board.records if pooled[r.environment].value == 0.5]:
+            why = "which then is the phase of the episode, not the dynamics"
+            sentences += _no_better(Board(records), clock, POOLED[-1], why, chance=False)
     return sentences
 
+
+def outcome_findings(board: Board) -> list[str]:
+    """Return a sentence where what knows the time alone tells failures as well as detectors do.
+
+    It is said of records that have the AUC of whole episodes, beside which that at equal time
+    stands.
+    """
+    clocks = [e for e in board.entries if e.detector == CLOCK and board.present([WHOLE])]
+    pairs = itertools.product(clocks, _TIME_ALONE.items())
+    return [s for clock, (name, why) in pairs for s in _no_better(board, clock, name, why)]
+
+
+def _no_better(
+    board: Board, clock: Setting, metric: str, why: str, *, chance: bool = True
+) -> list[str]:
+    """Return a sentence on the rows that are no better than the clock, or but for those at chance.
+
+    There is none without such rows.
+    """
+    info, listed = metric_info(metric), []
+    for entry in (e for e in board.entries if e.detector not in _SENSELESS):
+        time, value = board.compare(clock, entry, metric)
+        mean = board.of(entry, Column(metric, intervals=not chance))
+        if time >= value and (chance or not mean.low <= 0.5 <= mean.high):
+            listed.append(_against(board, entry, info.text(value), info.text(time)))
+    sentence = (
+        f"{clock}, which knows the time alone, is as good as or better than these rows in "
+        f"{info.title}, {why}: {', '.join(listed)}."
+    )
+    return [sentence] * bool(listed)
+
+
+_TIME_ALONE: Final = {
+    WHOLE: "which then is the length of the episode, not the failure",
+    OUTCOME: "at equal time, where it cannot tell failures",
+}
 
 _SENSELESS: Final = (*BLIND, "random")  # rows whose AUC nobody takes for the dynamics
 
@@ -754,6 +811,8 @@ def why_undefined(record: Record, metric: str) -> str:
         return "the detector does not explain its scores"
     if record.condition == NOMINAL:
         return "there are no anomalous episodes"
+    if metric == BRIER:
+        return "scores are no probabilities that were learnt from failures"
     return "it is computed with --row-metrics alone" if info.request else ""
 
 

@@ -13,7 +13,7 @@ from rich.console import Console
 
 from oodd_eval.cli.main import main
 from oodd_eval.errors import ResultsError
-from oodd_eval.metrics.catalogue import PAPER
+from oodd_eval.metrics.catalogue import PAPER, UNDEFINED
 from oodd_eval.prose import print_sections
 from oodd_eval.results.board import Board, boards
 from oodd_eval.results.record import Metric
@@ -211,6 +211,132 @@ def test_outcomes_are_one_table_with_the_clock_in_it_and_rank():
     titles = [table.title for table in Tables(Board(records)).all_alarms()]
     assert titles
     assert not [title for title in titles if "delay" in title]
+
+
+def with_lengths(auc, found, half, whole, **more):
+    """Metrics of a cell of outcomes with all that is known of it."""
+    values = {
+        "auc_outcome_half": half, "auc_outcome_whole": whole,
+        "balanced_outcome_at_5pct": (1 + found) / 2, "outcome_time_at_5pct": 12.0,
+    }  # fmt: skip
+    return outcome(auc, found) | values | more
+
+
+def banded():
+    """A column, two supervised rows, one of which is the best of all, and the clock."""
+    rows = [
+        log_record("clock", values=with_lengths(0.5, 0.0, 0.5, 0.85)),
+        log_record("chunk", values=with_lengths(0.7, 0.4, 0.6, 0.8)),
+        log_record("range", values=with_lengths([0.4, 0.7, 0.5, 0.4], 0.2, 0.5, 0.9)),
+    ]
+    taught = {"logistic": (0.9, [0.1, 0.2, 0.3, 0.2]), "tdqc": (0.45, 0.25)}
+    return rows + [
+        log_record(
+            name, values=with_lengths(auc, 0.5, auc, auc, brier_outcome=brier), training="failures"
+        )
+        for name, (auc, brier) in taught.items()
+    ]
+
+
+def test_the_table_of_outcomes_has_every_figure_that_records_have():
+    table = table_titled(banded(), "Episodes known by their outcome alone", "wide")
+    assert table.header[1:9] == [
+        "AUC of outcomes", "AUC at half time", "AUC of whole episodes", "found outcome",
+        "found outcome null", "balanced accuracy", "outcome delay (steps)", "brier score",
+    ]  # fmt: skip
+    assert column(table, "brier score") == {
+        "chunk": UNDEFINED, "clock": UNDEFINED, "range": UNDEFINED,
+        "logistic §": "0.200", "tdqc §": "0.250",
+    }  # fmt: skip
+    assert "brier score = squared distance of a probability of failure" in table.note
+    assert "brier score (scores are no probabilities that were learnt from failures)" in table.note
+    assert column(table, "balanced accuracy")["chunk"] == "70.0"
+    front = table_titled(banded(), "AUC of outcomes and guaranteed alarms", "brief")
+    assert front.header[1:] == ["AUC of outcomes", "found outcome", "balanced accuracy",
+                                "false episodes"]  # fmt: skip
+    wide = Report(banded(), detail="wide").sections[0].tables
+    (separability,) = [t for t in wide if t.title.startswith("All metrics")]
+    assert "Brier score" not in separability.header
+    (alarms,) = [t for t in wide if t.title.startswith("Guaranteed alarms at 5 %")]
+    assert "delays in steps" in alarms.title
+
+
+def test_rows_that_learn_from_failures_stand_below_the_others_with_a_mark():
+    records = banded()
+    order = ["chunk", "clock", "range", "logistic §", "tdqc §"]
+    for shuffled in (records, records[::-1]):
+        (section,) = Report(shuffled, detail="wide").sections
+        for table in section.tables:
+            assert [row[0] for row in table.rows] in (order, order[-2:]), table.title
+            assert "§ trained on failures" in table.note or "by detector seed" in table.title
+    assert "Not ranked, for what they know: logistic (trained on failures)" in (
+        table_titled(records, "AUC of outcomes", "brief").note
+    )
+    # The best of the others against the second, though a supervised row has the largest figure.
+    verdict = section.verdict
+    assert verdict.startswith(("chunk beats clock", "No difference is shown between chunk and"))
+    assert "logistic" not in verdict
+    # Where one row is left, no other band is put beside it.
+    (alone,) = Report([r for r in records if r.detector in ("chunk", "tdqc", "logistic")]).sections
+    assert alone.verdict.startswith("chunk on arm: ")
+    (taught,) = Report([r for r in records if r.training == "failures"]).sections
+    assert "between logistic and tdqc in AUC of outcomes" in taught.verdict
+    # With a value in fewer cells than the others it still is below them.
+    apart = [
+        *records,
+        *(replace(r, environment="press") for r in records if r.training == "nominal"),
+    ]
+    (section,) = Report(apart, detail="brief").sections
+    assert [row[0] for row in section.tables[0].rows][3:] == order[3:]
+
+
+def test_a_comparison_with_a_row_that_learns_from_failures_says_so():
+    records = banded()
+    text = str(compare_rows(records, "logistic", "chunk"))
+    assert "logistic learns from failures, the other does not." in text
+    assert "logistic learns" in compare_rows(records, "clock", "logistic").verdict
+    for pair in (("logistic", "tdqc"), ("chunk", "clock")):
+        assert "learns" not in str(compare_rows(records, *pair))
+    sentences = findings_of(Board(records))
+    named = [s for s in sentences if "tdqc" in s or "logistic" in s]
+    assert named
+    for sentence in named:
+        assert sentence.count("tdqc, trained on failures (") == sentence.count("tdqc")
+        assert sentence.count("logistic, trained on failures (") == sentence.count("logistic")
+
+
+def test_formats_mark_rows_that_learn_from_failures():
+    report = Report(banded())
+    rows = list(csv.DictReader(io.StringIO(FORMATS["csv"].render(report))))
+    kinds = {row["row"]: row["training"] for row in rows}
+    assert {kinds.pop("logistic"), kinds.pop("tdqc")} == {"failures"}
+    assert {*kinds.values()} == {"nominal"}
+    objects = json.loads(FORMATS["json"].render(report))
+    assert [o["training"] for o in objects] == ["nominal"] * 3 + ["failures"] * 2
+    for name in ("markdown", "html", "latex"):
+        text = FORMATS[name].render(report)
+        assert "logistic §" in text
+        assert "§ trained on failures" in text
+    # Without such rows formats are what they were.
+    assert "training" not in flat(banded()[:3])[0]
+    assert "§" not in str(Report(banded()[:3], detail="wide"))
+
+
+def test_the_clock_is_named_where_it_tells_failures_as_well():
+    (whole, equal) = [s for s in findings_of(Board(banded())) if s.startswith("clock, which")]
+    assert "in AUC of whole episodes, which then is the length" in whole
+    assert "chunk (80.0 against 85.0)" in whole
+    assert "range (" not in whole
+    assert "tdqc, trained on failures (45.0 against 85.0)" in whole
+    assert "in AUC of outcomes, at equal time" in equal
+    assert "range (50.0 against 50.0), tdqc, trained on failures (45.0 against 50.0)." in equal
+    # One sentence says it, not two.
+    assert not [s for s in findings_of(Board(banded())) if s.startswith("clock has a higher mean")]
+    better = log_record("chunk", values=with_lengths(0.7, 0.4, 0.6, 0.9))
+    assert not [s for s in findings_of(Board([banded()[0], better])) if "clock" in s]
+    # Of records without whole episodes nothing new is said.
+    old = [log_record(d, values=outcome(a, 0.1)) for d, a in (("clock", 0.5), ("chunk", 0.5))]
+    assert not [s for s in findings_of(Board(old)) if "clock" in s]
 
 
 def test_nominal_episodes_alone_have_false_alarms_and_no_rank():

@@ -28,12 +28,13 @@ from oodd_eval.metrics.bootstrap import nan_mean
 from oodd_eval.metrics.catalogue import HEADLINE, METRICS, NAMES, RANKING, metric_info
 from oodd_eval.metrics.cusum import DRIFT, THRESHOLD
 from oodd_eval.metrics.ranking import PairedDifference
+from oodd_eval.metrics.unpaired import OUTCOME_UP_TO
 from oodd_eval.results.board import Board, grouped
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import NAN, Record
 from oodd_eval.results.report import findings_of
 from oodd_eval.results.strengths import COSTS, DETECTION, Strengths, curve
-from oodd_eval.results.tables import PAPERS, POOLED, missing_level
+from oodd_eval.results.tables import ALARMS_OF_OUTCOMES, PAPERS, POOLED, missing_level
 from oodd_leaderboard.curve_file import read_curves
 from oodd_leaderboard.entry import Entry
 from oodd_leaderboard.reported import REPORTED, LeaderboardSection, Reported, SuiteSection
@@ -58,9 +59,9 @@ SUMMARIES: Final = tuple(f"{ALL}|{ALL}{group}" for group in ("", *GROUPS))
 ENTRY_FIELDS: Final = ("authors", "paper", "year", "url", "licence", "sha256")
 """Fields of an entry that the site shows."""
 
-_OF_LOGS: Final = (*POOLED, "auc_outcome")
+_OF_LOGS: Final = (*POOLED, *OUTCOME_UP_TO)
 _ALARMS_OF_LOGS: Final = (
-    *(*_COMPARED, "events_found", "false_alarms_per_hour", "found_outcome", "found_outcome_null"),
+    *(*_COMPARED, "events_found", "false_alarms_per_hour", *ALARMS_OF_OUTCOMES),
 )
 """Metrics with intervals where episodes have no twins; those of alarms at the board's level."""
 
