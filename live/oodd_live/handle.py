@@ -85,8 +85,8 @@ class DetectorHandle:
         horizon = read("horizon", partial(whole_number, least=1), horizon)
         kind: AlarmKind | None = next((kind for kind in STATISTICS if kind == statistic), None)
         if kind is None and statistic is not None:
-            expected = ", ".join(map(repr, STATISTICS))
-            raise UsageError(f"statistic={statistic!r}, expected one of {expected}")
+            raise UsageError(f"{statistic=}, expected one of {', '.join(map(repr, STATISTICS))}")
+        how: dict[str, Any] = {"seed": seed, "horizon": horizon, "parameters": parameters}
         name, looks_at_actions, adapts, supervised = "", True, False, False
         if isinstance(detector, str):
             plugins = discover()
@@ -94,24 +94,17 @@ class DetectorHandle:
             if actions:
                 offer, parameters = plugins.taking_actions(offer, parameters)
             offer.require()
+            how["parameters"] = parameters
             spec = offer.spec
             adapts = spec.adapts == "baseline"
-            detector = make_detector(
-                spec.factory,
-                seed=seed,
-                horizon=horizon,
-                parameters=parameters,
-                baseline=baseline if adapts else 0,
-                roles=roles if spec.roles else (),
-            )
+            rows, declared = baseline if adapts else 0, roles if spec.roles else ()
+            detector = make_detector(spec.factory, baseline=rows, roles=declared, **how)
             kind, name = kind or spec.alarm, spec.name
             looks_at_actions = spec.inputs != "observations"
             supervised = spec.training == "failures"
         elif isinstance(detector, type) or not isinstance(detector, Detector):
-            factory = factory_of(detector)
-            detector = make_detector(factory, seed=seed, horizon=horizon, parameters=parameters)
-        state: dict[str, Any] = {"name": name, "statistic": kind or "cusum"}
-        state |= {"seed": seed, "horizon": horizon}
+            detector = make_detector(factory_of(detector), **how)
+        state = how | {"name": name, "statistic": kind or "cusum"}
         state |= {"parameters": dict(parameters), "baseline": baseline, "roles": [*roles]}
         return cls(detector, kind or "cusum", looks_at_actions, adapts, state, supervised)
 
@@ -119,22 +112,18 @@ class DetectorHandle:
         self,
         nominal: Iterable[Trajectory],
         base: Baseline | None = None,
-        failures: Iterable[Trajectory] | None = None,
+        failures: Sequence[Trajectory] = (),
     ) -> None:
         """Fit the detector on what it may see; a supervised one takes failed episodes, too.
 
         `UsageError` where it lacks these, or a named one learns from nominal episodes alone.
         """
-        name = self.state["name"]
-        if self.supervised and failures is None:
-            raise UsageError(
-                f"{name} learns from failed episodes, too: Watchdog.fit takes failures=, or an "
-                "environment of logs imported with failures = 0.5"
-            )
-        if name and failures is not None and not self.supervised:
-            raise UsageError(f"{name} learns from nominal episodes alone: leave out failures")
+        if self.state["name"] and self.supervised != bool(failures):
+            learns = "failed episodes, too: failures= has them, or an environment of imported logs"
+            learns = learns if self.supervised else "nominal episodes alone: leave out failures"
+            raise UsageError(f"{self.state['name']} learns from {learns}")
         visible = [self.visible(x, base) for x in nominal]
-        failed = None if failures is None else [self.visible(x, base) for x in failures]
+        failed = [self.visible(x, base) for x in failures] if failures else None
         fit_detector(self.detector, visible, failures=failed)
 
     def visible(self, trajectory: Trajectory, base: Baseline | None = None) -> Trajectory:
@@ -172,15 +161,10 @@ class DetectorHandle:
                 "this watchdog was fitted with a detector without a name: load(path, detector) "
                 "needs the class, or an instance with the same parameters"
             )
-        return cls.make(
-            detector or state["name"],
-            None if state["statistic"] in RECORDED else state["statistic"],
-            int(state["seed"]),
-            int(state["horizon"]),
-            state["parameters"],
-            int(state["baseline"]),
-            tuple(map(str, state.get("roles", ()))),
-        )
+        statistic = None if state["statistic"] in RECORDED else state["statistic"]
+        how = int(state["seed"]), int(state["horizon"]), state["parameters"], int(state["baseline"])
+        roles = tuple(map(str, state.get("roles", ())))
+        return cls.make(detector or state["name"], statistic, *how, roles)
 
 
 def streaming(detector: Detector) -> StreamingDetector:

@@ -2,6 +2,7 @@
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Self, TypeAlias
 
 import numpy as np
@@ -15,6 +16,7 @@ from oodd_eval.data.parts import CALIBRATION, TRAIN, TWINS, EnvironmentData, col
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import TrajectoryError, UsageError
 from oodd_eval.metrics.promise import EpisodeMeans, PromiseFinding, promises
+from oodd_eval.names import read, whole_number
 from oodd_eval.plugins.state import Arrays, take
 
 Floats = NDArray[np.float64]
@@ -77,6 +79,8 @@ class NominalData:
     ----------
     train, calibration, further
         Nominal episodes as detectors may see them, and further ones that are known.
+    failures
+        Failed episodes.
     nominal
         What holds for all of them.
     rate
@@ -87,19 +91,17 @@ class NominalData:
         For each calibration episode the recording that it is a window of; None where each is one.
     other_recordings
         Those of the training episodes and of the further ones.
-    failures
-        Failed episodes; None without any.
     """
 
     train: list[Trajectory]
     calibration: list[Trajectory]
     further: list[Trajectory]
+    failures: list[Trajectory]
     nominal: Nominal
     rate: float | None
     recorded: bool
     recordings: Sequence[Hashable] | None = None
     other_recordings: Sequence[Sequence[Hashable] | None] = (None, None)
-    failures: list[Trajectory] | None = None
 
     @classmethod
     def of(
@@ -146,9 +148,7 @@ class NominalData:
                 "there are no calibration episodes, expected some, or an environment of a split "
                 "in place of training episodes"
             )
-        rows = 0 if baseline is None else baseline
-        if isinstance(rows, bool) or not isinstance(rows, int) or rows < 0:
-            raise UsageError(f"baseline={baseline!r}, expected a number of rows")
+        rows = read("baseline", partial(whole_number, least=0), baseline or 0)
         raw = [[_raw(x) for x in part] for part in (train, calibration, failures or ())]
         arrays = [x[0] for x in raw[0] if not isinstance(x, Trajectory)]
         widths = [(x.observations if isinstance(x, Trajectory) else x[0]).shape[1] for x in raw[0]]
@@ -170,10 +170,8 @@ class NominalData:
             check_baseline(map(len, calibrating), rows, "calibration")
         base = Baseline.fit(training, rows) if rows else None
         nominal = Nominal(names, subtracted, base, roles_of(sensors or ()), actions)
-        return cls(
-            training, calibrating, further, nominal, rate, recorded, recordings, others,
-            failed or None,
-        )  # fmt: skip
+        episodes = training, calibrating, further, failed
+        return cls(*episodes, nominal, rate, recorded, recordings, others)
 
     def findings(self) -> list[PromiseFinding]:
         """Return what was tested about the promise."""

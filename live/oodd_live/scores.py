@@ -2,7 +2,6 @@
 
 import math
 from collections import deque
-from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,9 +12,6 @@ from oodd_eval.metrics.alarms import GuaranteedAlarm, Monitor
 from oodd_live.stream import OBSERVATION
 
 Floats = NDArray[np.float64]
-
-SCORE: Final = "score"
-"""Name of the one column that a watchdog of scores has."""
 
 
 class ScoreMonitor(Monitor):
@@ -74,10 +70,6 @@ class ScoreStream:
         self.longest = max(self.longest, self._gap)
         self.surprise = math.inf if self._gap > self.most else 0.0
         return row, None
-
-    def update(self, row: Floats, _: object = None) -> float:
-        """Return the score of a row as it is: there is no detector."""
-        return float(row[0])
 
     def faults(self, *_: object) -> dict[int | str, str]:
         """Return the fault of a gap."""

@@ -40,10 +40,13 @@ from oodd_eval.plugins.voices import VoiceCosts, costs_of_voices
 from oodd_live.handle import DetectorHandle, columns_of, has_actions, streaming
 from oodd_live.nominal import Episode, Nominal, NominalData
 from oodd_live.reading import EpisodeAlarm, Reading, RunLength
-from oodd_live.scores import SCORE, ScoreMonitor, ScoreStream, longest_gap
+from oodd_live.scores import ScoreMonitor, ScoreStream, longest_gap
 from oodd_live.stream import OBSERVATION, Stream
 
 KIND: Final = "watchdog/4"
+
+CALIBRATED: Final = ("episodes", "rolling", "recordings", "recording_count")
+"""Facts of a calibration that a file has as they are."""
 
 Floats = NDArray[np.float64]
 
@@ -111,19 +114,16 @@ class Watchdog:
         self._nominal, self.sensors = nominal, list(nominal.sensors)
         self.settings, self.run_length, self.notes = settings, run_length, list(notes)
         self.voices: VoiceCosts | None = None
-        live: Any = streaming(handle.detector)
-        self._explain_last = getattr(live, "explain_last", None)
+        self._live = streaming(handle.detector)
+        self._explain_last = getattr(self._live, "explain_last", None)
         # Actuators that the detector sees: by number without names, or with those of sensors.
         names = enumerate(nominal.actions or [""] * len(rest))
         actuators = [n if n not in {"", *self.sensors} else f"actuator {j}" for j, n in names]
         self._parts = [*self.sensors, *actuators] if handle.actions else self.sensors
         commands = rest if handle.actions else ()
-        self._stream: Any
-        if stream is None:
-            self._stream = live = ScoreStream(settings.longest_gap or 0)
-        else:
+        self._stream: Any = ScoreStream(settings.longest_gap or 0)
+        if stream is not None:
             self._stream = Stream(stream, commands, settings.rate, nominal.baseline)
-        self._live = live
         # Rows at the start that are not judged, and rows that the detector is not shown.
         self._rows = nominal.baseline.rows if nominal.baseline else 0
         self._hidden = 0 if handle.adapts else self._rows
@@ -229,24 +229,15 @@ class Watchdog:
         )
         nominal = data.nominal
         rows = nominal.baseline.rows if nominal.baseline else 0
-        handle = DetectorHandle.make(
-            detector,
-            statistic,
-            seed,
-            horizon,
-            parameters or {},
-            rows,
-            nominal.roles,
-            actions=has_actions(data.train),
-        )
+        how = statistic, seed, horizon, parameters or {}, rows, nominal.roles
+        handle = DetectorHandle.make(detector, *how, actions=has_actions(data.train))
         settings = Settings(alpha, confidence, data.rate, latch, hold_off)
         if hours is not None:
             _check_hours(hours, settings, handle.alarm)
         training, calibrating = data.train, data.calibration
-        _check_shares(settings)
-        _check_enough(len(calibrating), settings, handle.alarm, hours)
-        failed = data.failures if failures or handle.supervised else None
-        handle.fit(training, nominal.baseline, failed)
+        _check_promise(len(calibrating), settings, handle.alarm, hours)
+        supervised = failures or handle.supervised
+        handle.fit(training, nominal.baseline, data.failures if supervised else ())
         stream = StreamScale.of_episodes(training, calibrating, nominal.baseline)
         if handle.alarm in RECORDED:
             # A monitor's number may stand still or go far: that is what it says.
@@ -267,14 +258,14 @@ class Watchdog:
                 warnings.warn(finding.text, PromiseWarning, stacklevel=2)
         if hours is None:
             largest = [float(surprise.max()) for surprise in faults]
-            joining = None if handle.alarm in RECORDED else largest
-            fitted = Calibration.fit(scores, handle.alarm, data.recordings, joining)
+            fitted = Calibration.fit(scores, handle.alarm, data.recordings, largest)
             if text := fitted.no_promise(alpha, confidence):
                 warnings.warn(text, PromiseWarning, stacklevel=2)
                 notes.insert(0, text)
             rule = fitted.rule(alpha, confidence)
-            # Missing flags alarm, too, where no flag of the calibration is up.
-            tail = fitted.tail or ParetoTail.fit(fitted.largest, float(handle.alarm == "flag"))
+            tail = fitted.tail or ParetoTail.fit(fitted.largest)
+            if handle.alarm == "flag":  # so that one that is missing alarms where none was up
+                tail = ParetoTail.fit(fitted.largest, 1.0)
             watchdog = cls(handle, fitted, rule, tail, stream, rest, nominal, settings, None, notes)
             visible = (handle.visible(x, nominal.baseline) for x in calibrating)
             start = rows if handle.adapts else 0
@@ -298,8 +289,7 @@ class Watchdog:
         """Watch the scores that a monitor computes: no detector is needed.
 
         `update` takes one number a row, NaN or None where there is none. A gap that is longer than
-        any in the calibration is a fault that alarms, too. `replay` and `explain` take arrays of
-        scores.
+        any in the calibration is a fault that alarms, too.
 
         Parameters
         ----------
@@ -326,27 +316,28 @@ class Watchdog:
         >>> healthy = [[0.1, peak, 0.2] for peak in range(1, 20)]
         >>> watchdog = Watchdog.of_scores(healthy)
         >>> watchdog.promise
-        'at most 5 % of nominal episodes raise an alarm, at most 1 of 20 by a gap of more than 0 \
-rows without a score'
+        'at most 5 % of nominal episodes raise an alarm by their scores, and at most 1 of 20 by a \
+gap of more than 0 rows without one'
         >>> print(watchdog.update(19.0), watchdog.update(19.5), sep="; ")
         row 0: nominal; row 1: alarm
         """
         if hasattr(calibration, "longest_gap"):
-            fitted, alpha = calibration.calibration, alpha or calibration.level
+            fitted, level = calibration.calibration, calibration.level
             facts = calibration.smoothing, calibration.hold, calibration.longest_gap
         else:
             scores = [as_numbers(x, f"episode {i}: ") for i, x in enumerate(calibration)]
-            fitted, alpha = Calibration.fit(scores, "column"), alpha or 0.05
+            fitted, level = Calibration.fit(scores, "column"), 0.05
             facts = None, 1, max(map(longest_gap, scores), default=0)
+        alpha = level if alpha is None else alpha
         settings = Settings(alpha, confidence, None, latch, hold_off, *facts)
-        _check_shares(settings)
-        _check_enough(fitted.episodes, settings, fitted.kind, None)
-        handle = DetectorHandle.make(
-            f"column:{SCORE}", "cusum" if fitted.kind == "cusum" else None, 0, 1, {}
-        )
-        notes = [*filter(None, [fitted.no_promise(alpha, confidence)])]
-        nominal = Nominal([SCORE], np.zeros(1), None)
-        parts = ParetoTail.fit(fitted.largest), None, np.zeros(0), nominal, settings, None, notes
+        _check_promise(fitted.episodes, settings, fitted.kind)
+        statistic = "cusum" if fitted.kind == "cusum" else None
+        handle = DetectorHandle.make("column:score", statistic, 0, 1, {})
+        if problem := fitted.no_promise(alpha, confidence):
+            warnings.warn(problem, PromiseWarning, stacklevel=2)
+        notes = [*filter(None, [problem]), *getattr(calibration, "notes", ())]
+        tail, nominal = ParetoTail.fit(fitted.largest), Nominal(["score"], np.zeros(1), None)
+        parts = tail, None, np.zeros(0), nominal, settings, None, notes
         return cls(handle, fitted, fitted.rule(alpha, confidence), *parts)
 
     @property
@@ -354,18 +345,14 @@ rows without a score'
         """The promise on false alarms as a sentence."""
         if (r := self.run_length) is None:
             alpha, confidence = self.settings.alpha, self.settings.confidence
-            if self.calibration and self.calibration.kind == "flag":
-                n = len(self.calibration.largest)
-                up = sum(x > self.rule.threshold for x in self.calibration.largest)
-                return f"nothing is promised: the flag is up in {up} of {n} calibration episodes"
             if self.calibration and (text := self.calibration.no_promise(alpha, confidence)):
                 return text
             sure = f", with {100 * confidence:.3g} % confidence" if confidence else ""
-            gaps = ""
-            if self.calibration and (longest := self.settings.longest_gap) is not None:
-                more = f"a gap of more than {longest} rows without a score"
-                gaps = f", at most 1 of {self.calibration.recording_count + 1} by {more}"
-            return f"at most {100 * alpha:.3g} % of nominal episodes raise an alarm{sure}{gaps}"
+            text = f"at most {100 * alpha:.3g} % of nominal episodes raise an alarm{sure}"
+            if self.calibration and (gap := self.settings.longest_gap) is not None:
+                text += f" by their scores, and at most 1 of {self.calibration.recording_count + 1}"
+                text += f" by a gap of more than {gap} rows without one"
+            return text
         interval = f"95 % interval {r.low:.3g} to {r.high:.3g} h"
         beyond = "" if r.hours <= r.observed else ", by the shape of the tail"
         return (
@@ -477,14 +464,13 @@ rows without a score'
             observation = [observation.get(name, math.nan) for name in self.sensors]
         return self._judged(self._measured(observation), action, time, acted)
 
-    def replay(self, episode: Trajectory | ArrayLike) -> list[Reading]:
+    def replay(self, episode: Trajectory) -> list[Reading]:
         """Judge a recorded episode of a split from its first row on.
 
         Parameters
         ----------
         episode
-            Observations of shape (T + 1, D) as a split has them: its offsets are subtracted. Or
-            scores, an array of shape (T + 1,).
+            Observations of shape (T + 1, D) as a split has them: its offsets are subtracted.
 
         Returns
         -------
@@ -496,9 +482,6 @@ rows without a score'
         TrajectoryError
             For what is no `Trajectory`.
         """
-        if self._scale is None:
-            self.reset()
-            return [self.update(score) for score in as_numbers(episode)]
         if not isinstance(episode, Trajectory):
             raise TrajectoryError(
                 f"the episode is a {type(episode).__name__}, expected a Trajectory, such as "
@@ -508,7 +491,7 @@ rows without a score'
         rows = zip(episode.observations, [None, *episode.actions], strict=True)
         return [self._judged(row, action, None, None) for row, action in rows]
 
-    def explain(self, episode: Trajectory | ArrayLike) -> list[EpisodeAlarm]:
+    def explain(self, episode: Trajectory) -> list[EpisodeAlarm]:
         """Return where a recorded episode alarms, which sensors are at fault, and since when.
 
         An alarm lasts as long as its cause here, whatever `latch` says. A copy of the watchdog
@@ -560,7 +543,8 @@ rows without a score'
             visible = row if shift is None else shift(row)
             first = self._t == self._hidden
             command = None if first or not self._handle.actions else command
-            score = float(self._live.update(visible, command))
+            # Scores need no detector.
+            score = float(self._live.update(visible, command) if self._scale else row[0])
         if self._t < self._rows:
             score = math.nan
         above = self._monitor.update(score)
@@ -582,18 +566,11 @@ rows without a score'
         alarm = bool(new or self.raised)
         # It takes as long as a score.
         sensors, onset, parts, kind = self._blamed() if alarm else ({}, None, {}, "")
-        reading = Reading(
-            self._t,
-            math.nan if math.isnan(score) else score,
-            max(self._monitor.statistic, value),
-            self.rule.threshold,
-            alarm,
-            sensors,
-            onset,
-            {self._name(d): fault for d, fault in self._faults.items()},
-            parts,
-            kind,
-        )
+        score = math.nan if math.isnan(score) else score
+        statistic = max(self._monitor.statistic, value)
+        faults = {self._name(d): fault for d, fault in self._faults.items()}
+        judged = self._t, score, statistic, self.rule.threshold, alarm
+        reading = Reading(*judged, sensors, onset, faults, parts, kind)
         if new and not self.raised:
             self.raised = reading
         return reading
@@ -678,13 +655,9 @@ rows without a score'
             "standardization": scale and scale.numbers,
             "calibration": calibration
             and {
+                **{name: getattr(calibration, name) for name in CALIBRATED},
                 # JSON has no infinities, of which there are two: as texts.
                 "largest": [x if math.isfinite(x) else str(x) for x in calibration.largest],
-                "episodes": calibration.episodes,
-                "rolling": calibration.rolling,
-                "recordings": calibration.recordings,
-                "recording_count": calibration.recording_count,
-                "joint": calibration.tail is not None,
             },
             "tail": list(self._tail),
             "run_length": self.run_length and list(astuple(self.run_length)),
@@ -738,9 +711,8 @@ rows without a score'
     def _of(cls, state: Mapping[str, Any], detector: AnyDetector | None) -> Self:
         """Return the watchdog that all this was written of."""
         values = state["watchdog"]
-        setting_values = values["settings"]
-        longest = setting_values.get("longest_gap")
-        stream = StreamScale.of(state) if longest is None else None
+        settings = Settings(**_numbers(values["settings"]))
+        stream = StreamScale.of(state) if settings.longest_gap is None else None
         tail = ParetoTail(*map(_finite, values["tail"]))
         rest = take(state, "rest", (None,))
         handle = DetectorHandle.from_state(values["made"], detector)
@@ -750,29 +722,15 @@ rows without a score'
             raise FittedStateError(f"it does not fit {type(handle.detector).__name__}")
         nominal = Nominal.of(state, names, int(values["made"]["baseline"]))
         nominal = replace(nominal, actions=tuple(map(str, values.get("actions", ()))))
-        scale, calibration_values, length = (
-            values[name] for name in ("standardization", "calibration", "run_length")
-        )
+        scale, facts, length = (values[n] for n in ("standardization", "calibration", "run_length"))
         standardization = scale and Standardization(*map(_finite, scale))
-        calibration = calibration_values and Calibration(
+        calibration = facts and Calibration(
             handle.alarm,
             standardization,
-            tuple(map(float, calibration_values["largest"])),
-            int(calibration_values["episodes"]),
-            tuple(map(int, calibration_values["recordings"])),
-            int(calibration_values["recording_count"]),
-            bool(calibration_values["rolling"]),
-            tail if calibration_values.get("joint", True) else None,
-        )
-        settings = Settings(
-            alpha=_finite(setting_values["alpha"]),
-            confidence=setting_values["confidence"] and _finite(setting_values["confidence"]),
-            rate=setting_values["rate"] and _finite(setting_values["rate"]),
-            latch=bool(setting_values["latch"]),
-            hold_off=int(setting_values["hold_off"]),
-            smoothing=setting_values.get("smoothing") and _finite(setting_values["smoothing"]),
-            hold=int(setting_values.get("hold", 1)),
-            longest_gap=None if longest is None else int(longest),
+            largest=tuple(map(float, facts.pop("largest"))),
+            recordings=tuple(map(int, facts.pop("recordings"))),
+            tail=tail,
+            **_numbers(facts),
         )
         rule = GuaranteedAlarm(standardization, _finite(values["threshold"]))
         length = length and RunLength(*map(_finite, length))
@@ -786,6 +744,11 @@ def _finite(value: float) -> float:
     if not math.isfinite(value):
         raise ValueError(f"{value} among what has to be finite")
     return float(value)
+
+
+def _numbers(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return values of a file by name: each None, or a finite number of its type."""
+    return {n: v if v is None else type(v)(_finite(v)) for n, v in values.items()}
 
 
 def _check_hours(hours: float, settings: Settings, kind: AlarmKind) -> None:
@@ -804,17 +767,14 @@ def _check_hours(hours: float, settings: Settings, kind: AlarmKind) -> None:
         )
 
 
-def _check_shares(settings: Settings) -> None:
-    """Raise `UsageError` unless alpha and confidence are shares."""
+def _check_promise(
+    episodes: int, settings: Settings, kind: AlarmKind, hours: float | None = None
+) -> None:
+    """Raise `UsageError` unless alpha and confidence are shares that there are episodes for."""
     alpha, confidence = settings.alpha, settings.confidence
     if not (0 < alpha < 1 and (confidence is None or 0 < confidence < 1)):
         expected = "shares between 0 and 1"
         raise UsageError(f"alpha={alpha!r}, confidence={confidence!r}: expected {expected}")
-
-
-def _check_enough(episodes: int, settings: Settings, kind: AlarmKind, hours: float | None) -> None:
-    """Raise `UsageError` when there are too few calibration episodes for the promise."""
-    alpha, confidence = settings.alpha, settings.confidence
     least = 1 if hours is not None or kind == "flag" else least_episodes(alpha, kind, confidence)
     if episodes < least:
         raise UsageError(too_few(f"alpha={alpha!r}", episodes, alpha, kind, confidence))

@@ -189,8 +189,8 @@ def test_a_split_gives_its_offsets_to_the_watchdog(tmp_path):
     [
         ({"offsets": [1.0]}, "expected 3 numbers"),
         ({"offsets": [1.0, math.nan, 0.0]}, "expected 3 numbers"),
-        ({"baseline": -1}, "expected a number of rows"),
-        ({"baseline": 2.5}, "expected a number of rows"),
+        ({"baseline": -1}, "baseline is -1, expected a whole number of at least 0"),
+        ({"baseline": 2.5}, "baseline is 2.5, expected a whole number"),
         ({"calibration": None}, "no calibration episodes"),
     ],
 )
