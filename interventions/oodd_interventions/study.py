@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from oodd_common.naming import ReadingModel
-from oodd_live.handle import DetectorHandle
+from oodd_live.handle import DetectorHandle, columns_of
 from oodd_recording.build import MOST_CANDIDATES, Progress, workers
 from oodd_recording.closed_loop import (
     SHORTEST_TWIN,
@@ -223,6 +223,12 @@ def intervene(
         raise UsageError(f"level is {level!r}, expected a share of episodes between 0 and 1")
     opened, plugins = load_split(split), discover()
     register([spec for spec, _ in plugins.custom_specs.values()])
+    detector_names = plugins.select(comma_list(detectors), opened.columns)
+    if recorded := [name for name in detector_names if columns_of(name)]:
+        raise UsageError(
+            f"{recorded[0]} is a column that is recorded, and no monitor computes it in a closed "
+            "loop: name detectors of sensors"
+        )
     environment_names, kinds = opened.select(comma_list(environments), comma_list(kinds or "all"))
     for environment in environment_names:
         _check_recorded(opened, environment, base)
@@ -230,7 +236,7 @@ def intervene(
     plan = make_plan(
         plugins,
         split=opened,
-        detectors=plugins.select(comma_list(detectors), opened.columns),
+        detectors=detector_names,
         environments=environment_names,
         anomalies=kinds,
         parameters=parameters,
@@ -343,7 +349,7 @@ def fit(study: Study, unit: Unit) -> None:
 def _fitted(study: Study, unit: Unit) -> FittedDetector:
     """Fit a detector, and find the threshold of its alarm."""
     handle, data = _handle(unit), _data(study.split, unit.environment)
-    handle.detector.fit([handle.visible(episode) for episode in data.train])
+    handle.fit(data.train)
     scores = [handle.scores(episode) for episode in data.calibration]
     return FittedDetector(handle, Calibration.fit(scores, handle.alarm).rule(study.level))
 

@@ -56,7 +56,7 @@ class Fit:
         base = Baseline.fit(training, self.baseline) if self.baseline else None
         hidden = 0 if handle.adapts else self.baseline
         try:
-            detector.fit([handle.visible(x, base) for x in training])
+            handle.fit(training, base)
             outcomes: list[Outcome] = []
             for x, is_explained in zip(episodes, explained, strict=True):
                 scores, explanation = handle.scores(x, base), None

@@ -14,7 +14,7 @@ from typing import Any, Final, Literal, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from oodd_live.handle import has_actions
+from oodd_live.handle import columns_of, has_actions
 from oodd_live.nominal import sensor_names
 from oodd_live.watchdog import Watchdog
 
@@ -344,6 +344,11 @@ def scan_episodes(
     """
     if not 0 < fdr < 1:
         raise UsageError(f"fdr={fdr!r}, expected a share between 0 and 1")
+    if columns_of(detector) and watchdog is None:
+        raise UsageError(
+            f"a scan fits detectors of sensors, and {detector} is a column that is recorded: "
+            "`oodd-eval calibrate` finds its threshold, and tells what that detects"
+        )
     ledger = Ledger() if ledger is None else ledger
     recorded, sensors = _recorded(episodes, sensors, ledger)
     widths = sorted({episode.observations.shape[1] for episode in recorded})
