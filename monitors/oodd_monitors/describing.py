@@ -81,7 +81,7 @@ def sentences(calibration: ScoreCalibration, name: str) -> Iterator[str]:
     yield from _levels(calibration)
     largest, share = calibration.sweep
     text = (
-        f"A hand sweep until none of these {counted(n, 'log(s)')} trips stops at {largest:.6g}, "
+        f"A hand sweep until none of these {counted(n, 'log(s)')} trips stops at {_rounded_up(largest)}, "
         f"and lets {100 * share:.3g} % (1/{n + 1}) of further healthy logs trip on average."
     )
     if largest > 0:
@@ -136,7 +136,7 @@ def _detected(row: Detections) -> str:
     """Return what is detected of a kind."""
     text = f"Of {counted(row.episodes, 'log(s)')} with {row.kind}: {row.detected} alarm"
     if not math.isnan(row.delay):
-        text += f" once it began, after {row.delay:g} rows in the median"
+        text += f" once it began, by a median delay of {row.delay:g} rows"
     elif row.detected:
         text += f", {row.in_time} of them before the shortest healthy log would end"
     early = f"; {row.early} before it began" if row.early else ""

@@ -13,6 +13,7 @@ import oodd_checks
 import oodd_leaderboard
 import oodd_live
 import oodd_logs
+import oodd_monitors
 import pytest
 import yaml
 
@@ -22,7 +23,7 @@ from oodd_eval import errors
 ROOT = Path(__file__).parents[2]
 SEARCH = [
     ROOT,
-    *(ROOT / name for name in ("checks", "leaderboard", "live", "logs", "recording")),
+    *(ROOT / name for name in ("checks", "leaderboard", "live", "logs", "monitors", "recording")),
     *(ROOT / "detectors").iterdir(),
 ]
 OPTIONAL = {"oodd_eval.scoring.executors.dask", "oodd_eval.__main__"}
@@ -37,7 +38,7 @@ DIRECTIVE = re.compile(r"^::: (\S+)\n((?:(?: {4}.*)?\n)*)", re.MULTILINE)
 def test_examples_give_what_they_print():
     names = {
         module.name
-        for top in (oodd_checks, oodd_eval, oodd_leaderboard, oodd_live, oodd_logs)
+        for top in (oodd_checks, oodd_eval, oodd_leaderboard, oodd_live, oodd_logs, oodd_monitors)
         for module in pkgutil.walk_packages(top.__path__, f"{top.__name__}.")
     } - OPTIONAL
     results = {name: doctest.testmod(importlib.import_module(name)) for name in sorted(names)}

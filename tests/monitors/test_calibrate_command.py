@@ -1,7 +1,9 @@
 """``oodd-eval calibrate`` in one command: on every kind of logs, and what it prints."""
 
 import json
+import re
 import struct
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -143,7 +145,7 @@ def test_the_text_says_what_a_threshold_is_worth(run, tmp_path):
     assert "stops at 1.19, and lets 4.76 % (1/21) of further healthy logs trip" in sentences[3]
     assert "drifts" in sentences[4]  # as numbers of the logs are its largest values
     assert sentences[5] == (
-        "Of 2 logs with fault: 2 alarm once it began, after 1 rows in the median; 0 never."
+        "Of 2 logs with fault: 2 alarm once it began, by a median delay of 1 rows; 0 never."
     )
     assert run("logs", "--score", "residual", "-q") == f"{first}\n"
 
@@ -152,7 +154,7 @@ def test_signs_holds_and_formulas(run, tmp_path):
     write_csv(tmp_path / "logs", range(40))
     least = float(run("logs", "--score", "-speed", "-q").split()[2])
     speeds = [-np.cos(np.arange(ROWS) + i).round(4).min() for i in range(40)]
-    assert least == pytest.approx(sorted(speeds)[-1])
+    assert least == pytest.approx(max(speeds))
     assert run("logs", "--score", "|residual|", "-q").startswith("|residual| > 1.38 m")
     held = run("logs", "--score", "abs(residual)", "--hold", 2)
     assert held.splitlines()[0].endswith(" m in 2 rows with a score in a row")
@@ -237,7 +239,23 @@ def test_training_and_calibration_episodes_of_a_split_are_healthy(run, tmp_path)
     firsts = np.array([above.argmax() for above in slips])  # each begins at row 30
     assert all(above.any() for above in slips)
     assert (
-        f"Of 5 logs with slip: {(firsts >= 30).sum()} alarm once it began, after "
-        f"{np.median(firsts[firsts >= 30]) - 30:g} rows in the median; {(firsts < 30).sum()} before"
+        f"Of 5 logs with slip: {(firsts >= 30).sum()} alarm once it began, by a median delay of "
+        f"{np.median(firsts[firsts >= 30]) - 30:g} rows; {(firsts < 30).sum()} before it began"
     ) in text
     assert "keeps no field but the task" in run("arm", "--score", "|q2|", "--per", "frame", code=4)
+
+
+def test_the_page_shows_what_is_printed(run, monkeypatch):
+    page = (Path(__file__).parents[2] / "docs" / "how-to" / "monitors.md").read_text()
+    program, shown, refused = (
+        re.search(pattern, page, re.MULTILINE | re.DOTALL)[1]
+        for pattern in (
+            r"^```python\n(.*?)^```$",
+            r"^```text\n(\|.*?)^```$",
+            r"run-00.*?\n(.*?)^```$",
+        )
+    )
+    exec(program, {})  # noqa: S102  of the page
+    monkeypatch.setenv("COLUMNS", "100")
+    assert run("runs", "--score", "|residual|") == shown
+    assert run("runs/run-00.csv", "--score", "residual", code=4) == refused

@@ -17,8 +17,10 @@ def logs_of(peaks):
     return [[0.0, peak, 0.5] for peak in peaks]
 
 
-@pytest.mark.parametrize(("n", "level", "rank"), [(19, 0.05, 19), (20, 0.05, 20), (39, 0.05, 38),
-                                                  (40, 0.10, 37), (9, 0.10, 9), (3, 0.25, 3)])  # fmt: skip
+RANKS = [(19, 0.05, 19), (20, 0.05, 20), (39, 0.05, 38), (40, 0.10, 37), (9, 0.10, 9), (3, 0.25, 3)]
+
+
+@pytest.mark.parametrize(("n", "level", "rank"), RANKS)
 def test_the_threshold_is_the_rank_that_further_logs_exceed_as_often_as_is_promised(n, level, rank):
     calibration = calibrate(logs_of(range(1, n + 1)), level)
     assert calibration.threshold == rank
@@ -108,9 +110,11 @@ def test_a_cusum_is_scaled_by_every_second_log():
     assert calibration.units == 19
     assert calibration.threshold == pytest.approx(max(max(sums(s)) for s in logs[1::2]))
     assert calibration.statistic(logs[7]) == pytest.approx([*sums(logs[7])])
-    with pytest.raises(UsageError, match=r"37 healthy logs, too few for 5 %: a CUSUM, half of which "
-                       r"scale it, needs 38, 1 more; --alarm threshold or ewma works.*"
-                       r"--level 5\.3"):  # fmt: skip
+    message = (
+        r"37 healthy logs, too few for 5 %: a CUSUM, half of which scale it, needs 38, 1 more; "
+        r"--alarm threshold or ewma works.*--level 5\.3"
+    )
+    with pytest.raises(UsageError, match=message):
         calibrate(logs[:37], 0.05, alarm="cusum")
 
 

@@ -118,6 +118,51 @@ KNOWN = {
         "folders": ["recording/policies"],
         "rules": {r"recording/(?=policies/)": ""},
     },
+    "docs/how-to/monitors.md": {
+        "files": {
+            "make_runs.py": "```python",
+            "pump.toml": "```toml",
+            "make.py": """
+                import json
+                import struct
+                from pathlib import Path
+
+                import numpy as np
+
+                def message(kind, content):
+                    return struct.pack("<HB", len(content), ord(kind)) + content
+
+                rng = np.random.default_rng(0)
+                formats = (
+                    b"estimator_innovation_test_ratios:uint64_t timestamp;float heading;",
+                    b"estimator_innovations:uint64_t timestamp;float[2] gps_hvel;",
+                )
+                Path("flights").mkdir()
+                for i in range(19):
+                    text = b"ULog\\x01\\x12\\x35\\x01" + struct.pack("<Q", 5)
+                    text += message("B", bytes(40)) + b"".join(message("F", f) for f in formats)
+                    for number, content in enumerate(formats):
+                        name = content.partition(b":")[0]
+                        text += message("A", struct.pack("<BH", 0, number) + name)
+                    for t, (a, b, c) in enumerate(rng.normal(size=(60, 3))):
+                        stamp = 200_000 * (t + 1)
+                        text += message("D", struct.pack("<HQf", 0, stamp, a * a))
+                        text += message("D", struct.pack("<HQff", 1, stamp, b, c))
+                    Path(f"flights/{i}.ulg").write_bytes(text)
+                Path("rollouts").mkdir()
+                for task in (0, 1):
+                    episodes = []
+                    for i in range(14):
+                        errors = rng.gamma(2, size=60 if i > 11 else 40 + i) + (i > 11)
+                        steps = [{"t": t, "chunk_mse": e, "grip": -e} for t, e in enumerate(errors)]
+                        facts = {"task_id": task, "success": i < 12, "steps": steps}
+                        episodes.append(json.dumps({"episode_id": i, **facts}))
+                    text = "\\n".join(episodes)
+                    Path(f"rollouts/task_{task}.jsonl").write_text(text)
+            """,
+        },
+        "before": ["python -m make_runs", "python -m make"],
+    },
     "docs/how-to/scan.md": {
         "files": {
             "arm.toml": """
