@@ -604,7 +604,7 @@ def _balanced(loud: Contribution, null: Contribution) -> Contribution:
     for side in (loud, quiet):
         shifted = side.numerator + (value - side.value) * side.denominator
         terms += np.array([shifted, side.denominator]) * (total / (2 * side.denominator.sum()))
-    return Contribution(*terms, nominal=loud.nominal)
+    return Contribution(terms[0], terms[1], nominal=loud.nominal)
 
 
 def _task_weights(cell: UnpairedScores, indices: Iterable[int]) -> Floats:
