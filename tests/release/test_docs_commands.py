@@ -216,7 +216,7 @@ KNOWN = {
                     columns = rng.normal(size=60), innovation, 1 * (innovation > 4), fault
                     lines = [",".join(map(str, row)) for row in zip(*columns, strict=True)]
                     text = "\\n".join(["height,vel_innov,tripped,fault", *lines])
-                    Path("logs", f"{i:02}.csv").write_text(text)
+                    Path("logs", f"{'wind' if i >= 45 else 'calm'}-{i}.csv").write_text(text)
             """,
         },
         "before": ["python -m make"],
