@@ -209,6 +209,8 @@ def test_wrong_names_and_the_base_of_the_split_are_refused(split, tmp_path):
         intervene("mewma-a", "cartpole", split=split, base=5, output=tmp_path)
     with pytest.raises(UnknownNameError, match="act"):
         intervene("mewma-a", "cartpole", split=split, acts="mosk", output=tmp_path)
+    with pytest.raises(UsageError, match=r"column:cart velocity is a column .* closed loop"):
+        intervene("mewma,column:cart velocity", "cartpole", split=split, output=tmp_path)
     assert not list(tmp_path.iterdir())
 
 

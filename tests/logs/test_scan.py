@@ -21,6 +21,7 @@ from oodd_logs.scanning.outliers import (
     surprise,
 )
 
+from oodd_eval.data.facts import Quantity
 from oodd_eval.errors import UnknownNameError, UsageError
 from oodd_eval.metrics.binomial import clopper_pearson
 
@@ -618,3 +619,31 @@ def test_a_watchdog_finds_columns_by_name_and_sees_faults_of_a_single_episode(wa
     one[50:60, 0] = np.nan
     (odd,) = scan_episodes([one], sensors=SENSORS, watchdog=watchdog).odd
     assert [(f.what, f.fault) for f in odd.faults] == [("speed", "missing")]
+
+
+def test_a_recorded_score_is_no_sensor_of_a_scan_and_judges_none():
+    episodes = logs()
+    alone = scan_episodes(episodes, sensors=SENSORS, detector="mahalanobis")
+    jumps = np.random.default_rng(1).normal(size=(150, 1)) * 100
+    scored = [np.hstack([x, jumps * (i == 3)]) for i, x in enumerate(episodes)]
+    columns = [Quantity(name, "1") for name in SENSORS] + [Quantity("mse", "1", "score")]
+    beside = scan_episodes(scored, sensors=columns, detector="mahalanobis")
+    assert beside.sensors == alone.sensors == SENSORS
+    assert [x.episode.name for x in beside.ranked] == [x.episode.name for x in alone.ranked]
+    for one, other in zip(beside.episodes, alone.episodes, strict=True):
+        assert one.scores == pytest.approx(other.scores, nan_ok=True)
+        assert one.p == pytest.approx(other.p)
+    with pytest.raises(UsageError, match=r"column:mse is a column .* `oodd-eval calibrate`"):
+        scan_episodes(scored, sensors=columns, detector="column:mse")
+
+
+def test_a_watchdog_of_a_column_judges_the_episodes_of_a_scan_by_it():
+    rng = np.random.default_rng(2)
+    episodes = [np.hstack([x, rng.gamma(2, size=(150, 1))]) for x in logs(n=60)]
+    columns = [*SENSORS, "mse"]
+    watchdog = Watchdog.fit("column:mse", episodes[:5], episodes[5:45], 0.05, sensors=columns)
+    judged = [x.copy() for x in episodes[45:55]]
+    judged[4][90:, 3] += 30.0
+    quantities = [Quantity(name, "1") for name in SENSORS] + [Quantity("mse", "1", "score")]
+    first = scan_episodes(judged, sensors=quantities, watchdog=watchdog).ranked[0]
+    assert (first.episode.name, first.row, first.faults) == ("episode 4", 90, ())

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from oodd_live.handle import DetectorHandle
+from oodd_live.handle import DetectorHandle, columns_of
 
 from oodd_eval.data.baseline import Baseline
 from oodd_eval.data.trajectory import Trajectory
-from oodd_eval.errors import ContractError, OoddError
+from oodd_eval.errors import ContractError, OoddError, UsageError
 from oodd_eval.plugins.contract import AnyDetector
 from oodd_eval.plugins.explanations import ExplainingDetector, Explanation, checked_explanation
 from oodd_logs.scanning.limits import FITS
@@ -36,7 +36,12 @@ class Fit:
     actions: bool
 
     def handle(self) -> DetectorHandle:
-        """Return a new detector."""
+        """Return a new detector; `UsageError` for a column."""
+        if columns_of(self.detector):
+            raise UsageError(
+                f"a scan fits detectors of sensors, and {self.detector} is a column that is "
+                "recorded: `oodd-eval calibrate` finds its threshold, and tells what that detects"
+            )
         settings = self.seed, self.horizon, self.parameters, self.baseline, self.roles
         return DetectorHandle.make(self.detector, None, *settings, actions=self.actions)
 

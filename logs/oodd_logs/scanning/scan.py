@@ -14,13 +14,13 @@ from typing import Any, Final, Literal, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from oodd_live.handle import columns_of, has_actions
+from oodd_live.handle import has_actions
 from oodd_live.nominal import sensor_names
 from oodd_live.watchdog import Watchdog
 
 from oodd_eval.arrays import as_numbers
 from oodd_eval.data.bounded import without_nan
-from oodd_eval.data.facts import roles_of
+from oodd_eval.data.facts import Role, roles_of
 from oodd_eval.errors import UnknownNameError, UsageError
 from oodd_eval.metrics.alarms import AlarmKind, GuaranteedAlarm, window_weights
 from oodd_eval.metrics.cusum import Standardization
@@ -344,17 +344,14 @@ def scan_episodes(
     """
     if not 0 < fdr < 1:
         raise UsageError(f"fdr={fdr!r}, expected a share between 0 and 1")
-    if columns_of(detector) and watchdog is None:
-        raise UsageError(
-            f"a scan fits detectors of sensors, and {detector} is a column that is recorded: "
-            "`oodd-eval calibrate` finds its threshold, and tells what that detects"
-        )
     ledger = Ledger() if ledger is None else ledger
     recorded, sensors = _recorded(episodes, sensors, ledger)
     widths = sorted({episode.observations.shape[1] for episode in recorded})
     if len(widths) != 1:
         raise UsageError(f"episodes have {widths} sensors, expected the same number in all")
     names, roles = sensor_names(sensors, widths[0]), roles_of(sensors or ())
+    if "score" in roles and watchdog is None:
+        recorded, names, roles = _without_scores(recorded, sensors or ())
     recorded, notes = _cut(recorded, window)
     shortest = baseline + SHORTEST
     usable = [episode for episode in recorded if len(episode.observations) >= shortest]
@@ -434,6 +431,16 @@ def _recorded(
     with source:
         ledger.merge(source.ledger)
         return [*source.episodes(EVERY)], sensors or source.sensors
+
+
+def _without_scores(
+    episodes: Sequence[Episode], columns: Sequence[Any]
+) -> tuple[list[Episode], list[str], tuple[Role, ...]]:
+    """Return episodes without what monitors computed, names and roles of the sensors."""
+    kept = [i for i, column in enumerate(columns) if getattr(column, "role", "") != "score"]
+    sensors = [columns[i] for i in kept]
+    shown = [replace(e, observations=e.observations[:, kept]) for e in episodes]
+    return shown, sensor_names(sensors, len(kept)), roles_of(sensors)
 
 
 def _as_episode(episode: Episode | ArrayLike, number: int) -> Episode:
