@@ -338,6 +338,20 @@ def test_failed_episodes_reach_the_detectors_that_learn_from_them(scored, monkey
         Watchdog.fit("mahalanobis", nominal, calibration, 0.1, failures=[*data.failures])
 
 
+@pytest.mark.parametrize("name", ["logistic", "tdqc"])
+def test_a_probability_of_failure_is_that_of_the_row_and_is_kept_in_a_file(scored, name, tmp_path):
+    data, _ = scored
+    watchdog = Watchdog.fit(name, data, alpha=0.1)
+    watchdog.save(tmp_path / "kept")
+    loaded = Watchdog.load(tmp_path / "kept")
+    slip = data.labelled("slip")[0]
+    readings = watchdog.replay(slip)
+    assert loaded.replay(slip) == readings
+    scores = [reading.score for reading in readings]
+    np.testing.assert_allclose(scores, watchdog._handle.detector.score(slip), atol=1e-6)
+    assert all(0 <= score <= 1 for score in scores if not np.isnan(score))
+
+
 class Unnamed:
     """Learns from failures; without a name."""
 
