@@ -439,8 +439,8 @@ def _without_scores(
     """Return episodes without what monitors computed, names and roles of the sensors."""
     kept = [i for i, column in enumerate(columns) if getattr(column, "role", "") != "score"]
     sensors = [columns[i] for i in kept]
-    shown = [replace(e, observations=e.observations[:, kept]) for e in episodes]
-    return shown, sensor_names(sensors, len(kept)), roles_of(sensors)
+    stripped = [replace(e, observations=e.observations[:, kept]) for e in episodes]
+    return stripped, sensor_names(sensors, len(kept)), roles_of(sensors)
 
 
 def _as_episode(episode: Episode | ArrayLike, number: int) -> Episode:
