@@ -81,8 +81,9 @@ def sentences(calibration: ScoreCalibration, name: str) -> Iterator[str]:
     yield from _levels(calibration)
     largest, share = calibration.sweep
     text = (
-        f"A hand sweep until none of these {counted(n, 'log(s)')} trips stops at {_rounded_up(largest)}, "
-        f"and lets {100 * share:.3g} % (1/{n + 1}) of further healthy logs trip on average."
+        f"A hand sweep until none of these {counted(n, 'log(s)')} trips stops at "
+        f"{_rounded_up(largest)}, and lets {100 * share:.3g} % (1/{n + 1}) of further healthy logs "
+        "trip on average."
     )
     if largest > 0:
         text += " A margin on top lets fewer trip: how many fewer, healthy logs do not tell."
