@@ -7,10 +7,12 @@ episodes, which at most the level of further healthy episodes exceed.
 import math
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Final, Literal, NamedTuple, get_args
+from itertools import accumulate
+from typing import Final, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from oodd_live.scores import longest_gap
 
 from oodd_eval.arrays import as_numbers
 from oodd_eval.errors import UsageError
@@ -54,7 +56,8 @@ class LabelledScores(NamedTuple):
     kind: str = "anomalous"
 
 
-class Detections(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class Detections:
     """What a threshold detects of the episodes of one kind.
 
     Attributes
@@ -85,7 +88,8 @@ class Detections(NamedTuple):
     in_time: int
 
 
-class ScoreGroup(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class ScoreGroup:
     """Healthy episodes of one group, such as an airframe or a task.
 
     Attributes
@@ -186,14 +190,10 @@ class ScoreCalibration:
     @property
     def notes(self) -> tuple[str, ...]:
         """What puts the promise in doubt, in sentences."""
-        test = self.drift
-        grouped = " Groups that follow one another look alike." if self.groups else ""
-        drift = (
-            "The score drifts: its largest values follow the order of the logs (rank correlation "
-            f"{test.statistic:.2f}, p = {test.p:.2g}), so that more logs than promised may alarm. "
-            f"Calibrate on logs of the days that are judged, or on the newest alone.{grouped}"
-        )
-        return (drift,) if test.significant else ()
+        figures = f"rank correlation {self.drift.statistic:.2f}, p = {self.drift.p:.2g}"
+        text = f"The largest values follow the order of the logs ({figures}): newer logs may alarm"
+        text += " more often than promised. Calibrate on logs like those that are judged."
+        return (text,) if self.drift.significant else ()
 
     @property
     def share_interval(self) -> tuple[float, float] | None:
@@ -205,10 +205,8 @@ class ScoreCalibration:
         """
         if not self.whole:
             return None
-        n, k = (
-            len(self.calibration.largest),
-            quantile_rank(len(self.calibration.largest), self.level),
-        )
+        n = len(self.calibration.largest)
+        k = quantile_rank(n, self.level)
         tied = self.calibration.largest.count(self.threshold) > 1
         return 0.0 if tied else clopper_pearson(n + 1 - k, n)[0], clopper_pearson(n - k, n)[1]
 
@@ -314,131 +312,76 @@ def calibrate(
     check_known("alarm", get_args(ScoreAlarm), alarm)
     hold = whole_number(hold, least=1)
     alarm = "threshold" if alarm == "score" else alarm
-    kind: AlarmKind = "cusum" if alarm == "cusum" else "column"
-    episodes = _checked(scores)
+    episodes = _checked(scores, hold)
     numbers = numbered(recordings, len(episodes))
     _check_enough(numbers, level, alarm)
+    fitted = Calibration.fit(episodes, _kind(alarm), numbers.tolist())
     smoothing = SMOOTHING if alarm == "ewma" else None
-    smoothed = [_smoothed(values[~np.isnan(values)], smoothing) for values in episodes]
-    fitted = Calibration.fit(smoothed, kind, numbers.tolist())
     statistics = (_statistic(s, fitted.unbounded, smoothing, hold) for s in episodes)
-    largest = np.array([float(s.max(initial=-math.inf)) for s in statistics])
-    part = halves(numbers)[1] if kind == "cusum" else np.arange(len(episodes))
+    largest = np.array([s.max(initial=-math.inf) for s in statistics])
+    part = halves(numbers)[1] if alarm == "cusum" else slice(None)
     fitted = replace(fitted, largest=tuple(largest[part].tolist()))
-    if math.isinf(threshold := fitted.threshold(level)):
-        raise UsageError(_unbounded(fitted, hold, threshold))
-    tops = np.full(numbers.max() + 1, -math.inf)
-    np.maximum.at(tops, numbers, largest)
-    calibration = ScoreCalibration(
-        GuaranteedAlarm(fitted.standardization, threshold),
-        alarm,
-        hold,
-        level,
-        fitted,
-        max(map(_longest_gap, episodes)),
-        drift_test(tops[:, None]),
-    )
-    options: dict[str, Any] = {"alarm": alarm, "hold": hold}
+    tops = np.full((fitted.recording_count, 1), -math.inf)
+    np.maximum.at(tops[:, 0], numbers, largest)
+    rule, gap, drift = fitted.rule(level), max(map(longest_gap, episodes)), drift_test(tops)
+    calibration = ScoreCalibration(rule, alarm, hold, level, fitted, gap, drift)
     return replace(
         calibration,
         false_alarms=sum(calibration.first(s) is not None for s in healthy),
         healthy=len(healthy),
         detections=_detections(calibration, labelled, min(map(len, episodes))),
-        groups=_groups(calibration, episodes, numbers, groups, options) if groups else {},
+        groups=_groups(calibration, episodes, numbers, groups) if groups else {},
     )
 
 
-def _checked(scores: Sequence[ArrayLike]) -> list[Floats]:
+def _checked(scores: Sequence[ArrayLike], hold: int) -> list[Floats]:
     """Return the scores of episodes as arrays; `UsageError` where they are no score."""
     episodes = [as_numbers(s, f"episode {i} of the scores: ") for i, s in enumerate(scores)]
-    for i, values in enumerate(episodes):
-        if values.ndim != 1:
-            raise UsageError(f"episode {i} has scores of shape {values.shape}, expected one a row")
-        if np.isnan(values).all():
-            raise UsageError(f"episode {i} has no score: leave it out, or correct its log")
+    for i, s in enumerate(episodes):
+        if s.ndim != 1 or np.count_nonzero(~np.isnan(s)) < hold:
+            expected = f"a number a row, in {hold} rows at least: leave it out"
+            raise UsageError(f"episode {i} has scores of shape {s.shape}, expected {expected}")
     pooled = np.concatenate([np.zeros(0), *episodes])
-    values = np.unique(pooled[~np.isnan(pooled)]).tolist()
-    if len(values) == 1:
+    values = [f"{value:g}" for value in np.unique(pooled[~np.isnan(pooled)])]
+    if 0 < len(values) < 3:
         raise UsageError(
-            f"the score is {values[0]:g} in all rows of all {len(episodes)} healthy logs, so that "
-            "no threshold means anything: name a column that varies. An alarm that never was on "
-            "has its operating point already: run --detector flag:NAME judges it"
-        )
-    if len(values) == 2:
-        raise UsageError(
-            f"the score has only the values {values[0]:g} and {values[1]:g}, as an alarm has, and "
-            "no threshold is to be set: run --detector flag:NAME judges it as it is, or name the "
-            "number that it is made of"
+            f"the score is {' or '.join(values)} in all rows of {len(episodes)} healthy logs: name "
+            "a column that varies. If it is an alarm already, it needs no threshold, and "
+            "`oodd-eval run --detector flag:NAME` judges it"
         )
     return episodes
 
 
 def _check_enough(numbers: NDArray[np.intp], level: float, alarm: ScoreAlarm) -> None:
     """Raise `UsageError` where even windows of recordings are too few for a level."""
-    n, whole = len(numbers), len({*numbers.tolist()}) == len(numbers)
-    kind: AlarmKind = "cusum" if alarm == "cusum" else "score"
-    least = least_episodes(level, kind)
+    n, least = len(numbers), least_episodes(level, _kind(alarm))
     if n >= least:
         return
-    few = counted(n, "healthy log(s)" if whole else "healthy window(s)")
-    text = (
-        f"{few}, too few for {100 * level:.3g} %: {_NAMES[alarm]} needs {least}, {least - n} more"
-    )
-    allowed = n // 2 if kind == "cusum" else n
-    if kind == "cusum" and n >= least_episodes(level, "score"):
-        text += "; --alarm threshold or ewma works with these"
-    if allowed:
-        percent = math.ceil(1000 / (allowed + 1) - 1e-9) / 10
-        text += f"; these allow {percent:.3g} % (--level {percent:.3g})"
+    noun = "log" if len({*numbers.tolist()}) == n else "window"
+    text = f"{counted(n, f'healthy {noun}(s)')}, too few for {100 * level:.3g} %: "
+    text += f"the alarm {alarm} needs {least}, {least - n} more"
+    text += "; threshold and ewma do not" * (n >= least_episodes(level, "column"))
+    if allowed := n // 2 if alarm == "cusum" else n:
+        percent = f"{math.ceil(1000 / (allowed + 1) - 1e-9) / 10:.3g}"
+        text += f"; these allow {percent} % (--level {percent})"
     raise UsageError(text)
 
 
-_NAMES: Final[Mapping[str, str]] = {
-    "threshold": "a threshold",
-    "cusum": "a CUSUM, half of which scale it,",
-    "ewma": "a weighted mean",
-}
-
-
-def _unbounded(fitted: Calibration, hold: int, threshold: float) -> str:
-    """Say why a threshold is infinite."""
-    infinite = sum(value == threshold for value in fitted.largest)
-    cause = "an infinite score"
-    if threshold < 0:
-        cause = f"fewer than {hold} rows with a score (hold)"
-    return (
-        f"{infinite} of {counted(len(fitted.largest), 'healthy log(s)')} have {cause}, so that "
-        "there is no threshold: leave them out, or choose a larger level"
-    )
-
-
-def _smoothed(scores: Floats, weight: float | None) -> Floats:
-    """Return exponentially weighted means, from the first score on; without a weight the scores."""
-    if weight is None or not len(scores):
-        return scores
-    mean, means = float(scores[0]), []
-    for score in scores.tolist():
-        mean += weight * (score - mean)
-        means.append(mean)
-    return np.array(means)
+def _kind(alarm: ScoreAlarm) -> AlarmKind:
+    return "cusum" if alarm == "cusum" else "column"
 
 
 def _statistic(scores: Floats, rule: GuaranteedAlarm, smoothing: float | None, hold: int) -> Floats:
     """Return what alarms are of: the least of the last `hold` rows that have a score."""
-    present = ~np.isnan(scores)
-    values = rule.statistic(_smoothed(scores[present], smoothing))
-    if hold > 1 and len(values):
-        padded = np.concatenate([np.full(hold - 1, -math.inf), values])
-        values = np.lib.stride_tricks.sliding_window_view(padded, hold).min(axis=1)
-    statistic = np.full(len(scores), -math.inf)
-    statistic[present] = values
+    present, statistic = ~np.isnan(scores), np.full(len(scores), -math.inf)
+    values = scores[present]
+    if smoothing:
+        means = accumulate(values.tolist(), lambda mean, s: mean + smoothing * (s - mean))
+        values = np.fromiter(means, np.float64)
+    padded = np.concatenate([np.full(hold - 1, -math.inf), rule.statistic(values)])
+    if len(values):
+        statistic[present] = np.lib.stride_tricks.sliding_window_view(padded, hold).min(axis=1)
     return statistic
-
-
-def _longest_gap(scores: Floats) -> int:
-    """Return the most rows without a score, one after another, before, between or after others."""
-    present = np.flatnonzero(~np.isnan(scores))
-    return int(np.diff(present, prepend=-1, append=len(scores)).max()) - 1
 
 
 def _detections(
@@ -449,21 +392,14 @@ def _detections(
     for kind in dict.fromkeys(episode.kind for episode in labelled):
         episodes = [episode for episode in labelled if episode.kind == kind]
         starts = [e.intervals[0][0] if e.intervals else -1 for e in episodes]
-        firsts = [calibration.first(episode.scores) for episode in episodes]
-        alarms = [(f, s) for f, s in zip(firsts, starts, strict=True) if f is not None]
+        pairs = zip(map(calibration.first, [e.scores for e in episodes]), starts, strict=True)
+        alarms = [(first, start) for first, start in pairs if first is not None]
         detected = [(first, start) for first, start in alarms if first >= start]
         delays = [first - start for first, start in detected if start >= 0]
-        rows.append(
-            Detections(
-                kind,
-                len(episodes),
-                len(alarms) - len(detected),
-                len(detected),
-                len(episodes) - len(alarms),
-                float(np.median(delays)) if delays else math.nan,
-                sum(first < shortest for first, _ in detected),
-            )
-        )
+        delay = float(np.median(delays)) if delays else math.nan
+        in_time = sum(first < shortest for first, _ in detected)
+        n, early = len(episodes), len(alarms) - len(detected)
+        rows.append(Detections(kind, n, early, len(detected), n - len(alarms), delay, in_time))
     return rows
 
 
@@ -472,19 +408,17 @@ def _groups(
     episodes: Sequence[Floats],
     numbers: NDArray[np.intp],
     groups: Sequence[str],
-    options: Mapping[str, Any],
 ) -> dict[str, ScoreGroup]:
     """Return the thresholds of groups, and how many of their episodes exceed the pooled one."""
     if len(groups) != len(episodes):
         raise UsageError(f"{len(groups)} groups of {len(episodes)} episodes, expected one for each")
-    result = {}
+    result, (level, alarm, hold) = {}, (pooled.level, pooled.alarm, pooled.hold)
     for name in dict.fromkeys(groups):
-        indices = [i for i, group in enumerate(groups) if group == name]
-        scores = [episodes[i] for i in indices]
-        recordings = numbers[indices].tolist()
+        members = [i for i, group in enumerate(groups) if group == name]
+        scores, of_group = [episodes[i] for i in members], numbers[members].tolist()
         calibration, problem = None, ""
         try:
-            calibration = calibrate(scores, pooled.level, recordings=recordings, **options)
+            calibration = calibrate(scores, level, alarm=alarm, hold=hold, recordings=of_group)
         except UsageError as error:
             problem = str(error)
         above = sum(pooled.first(s) is not None for s in scores)

@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Iterator
-from typing import Any, Final
+from dataclasses import asdict
+from typing import Any
 
 from oodd_eval.metrics.alarms import least_episodes
 from oodd_eval.metrics.binomial import clopper_pearson
@@ -10,8 +11,6 @@ from oodd_eval.metrics.catalogue import LEVELS
 from oodd_eval.metrics.cusum import DRIFT, UNIT
 from oodd_eval.names import counted
 from oodd_monitors.calibrating import Detections, ScoreCalibration
-
-_DIGITS: Final = 6  # of a threshold to copy
 
 
 def condition(calibration: ScoreCalibration, name: str, unit: str = "") -> str:
@@ -21,9 +20,7 @@ def condition(calibration: ScoreCalibration, name: str, unit: str = "") -> str:
     ----------
     calibration
         The threshold.
-    name
-        Of the score.
-    unit
+    name, unit
         Of the score.
 
     Returns
@@ -34,26 +31,25 @@ def condition(calibration: ScoreCalibration, name: str, unit: str = "") -> str:
     Examples
     --------
     >>> from oodd_monitors.calibrating import calibrate
-    >>> condition(calibrate([[0.0, i / 3] for i in range(1, 20)]), "residual", "m")
+    >>> condition(calibrate([[0.0, 0.5, i / 3] for i in range(1, 20)]), "residual", "m")
     'residual > 6.33334 m'
     """
-    name = {"cusum": f"cusum({name})", "ewma": f"ewma({name})"}.get(calibration.alarm, name)
+    name = name if calibration.alarm == "threshold" else f"{calibration.alarm}({name})"
     rows = f" in {calibration.hold} rows with a score in a row" if calibration.hold > 1 else ""
-    shown_unit = f" {unit}" if unit not in {"", "1"} and calibration.alarm != "cusum" else ""
-    return f"{name} > {_rounded_up(calibration.threshold)}{shown_unit}{rows}"
+    unit = "" if unit == "1" or calibration.alarm == "cusum" else unit
+    return f"{name} > {_rounded_up(calibration.threshold)} {unit}".rstrip() + rows
 
 
 def _rounded_up(value: float) -> str:
     """Return a number with six digits that is not below it."""
-    text = f"{value:.{_DIGITS}g}"
+    text = f"{value:.6g}"
     if float(text) < value:
-        unit = 10.0 ** (math.floor(math.log10(abs(value))) + 1 - _DIGITS)
-        text = f"{float(text) + unit:.{_DIGITS}g}"
+        text = f"{float(text) + 10.0 ** (math.floor(math.log10(abs(value))) - 5):.6g}"
     return text
 
 
 def sentences(calibration: ScoreCalibration, name: str) -> Iterator[str]:
-    """Yield what the threshold is worth.
+    """Yield what the threshold is worth, in sentences.
 
     Parameters
     ----------
@@ -61,56 +57,8 @@ def sentences(calibration: ScoreCalibration, name: str) -> Iterator[str]:
         The threshold.
     name
         Of the score.
-
-    Yields
-    ------
-    str
-        Sentences, in the order in which they are read.
     """
-    yield from _formula(calibration, name)
-    whole = "" if calibration.whole else " Logs that no window cuts would promise it of whole logs."
-    yield f"{_upper(calibration.promise)}.{whole}"
-    n, kind = calibration.units, calibration.calibration.kind
-    if interval := calibration.share_interval:
-        low, high = (100 * share for share in interval)
-        used = f"{n} healthy logs" if kind != "cusum" else f"{n} healthy logs, the others scale it"
-        yield (
-            f"The true share at this threshold is {low:.2g} to {high:.2g} % (95 % interval, from "
-            f"{used})."
-        )
-    yield from _levels(calibration)
-    largest, share = calibration.sweep
-    text = (
-        f"A hand sweep until none of these {counted(n, 'log(s)')} trips stops at "
-        f"{_rounded_up(largest)}, and lets {100 * share:.3g} % (1/{n + 1}) of further healthy logs "
-        "trip on average."
-    )
-    if largest > 0:
-        text += " A margin on top lets fewer trip: how many fewer, healthy logs do not tell."
-    yield text
-    test = calibration.drift
-    figures = f"rank correlation {test.statistic:.2f}, p = {test.p:.2g}"
-    if not calibration.notes:
-        yield f"No drift seen over the logs ({figures})."
-    yield from calibration.notes
-    if calibration.healthy:
-        alarms, n = calibration.false_alarms, calibration.healthy
-        low, high = (100 * share for share in clopper_pearson(alarms, n))
-        yield (
-            f"Of {counted(n, 'further healthy log(s)')} {alarms} alarm "
-            f"({100 * alarms / n:.3g} %, 95 % interval {low:.2g} to {high:.3g})."
-        )
-    yield from map(_detected, calibration.detections)
-
-
-def _upper(text: str) -> str:
-    return text[:1].upper() + text[1:]
-
-
-def _formula(calibration: ScoreCalibration, name: str) -> Iterator[str]:
-    """Yield how the statistic is computed, where it is not the score."""
-    scale = calibration.rule.standardization
-    if scale is not None:
+    if scale := calibration.rule.standardization:
         factor = UNIT / scale.std if scale.std else math.inf
         yield (
             f"cusum: S = max(0, S + {factor:.6g} * ({name} - {scale.mean:.6g}) - {DRIFT:g}), from "
@@ -118,19 +66,39 @@ def _formula(calibration: ScoreCalibration, name: str) -> Iterator[str]:
         )
     if calibration.smoothing:
         yield f"ewma: m = m + {calibration.smoothing:g} * ({name} - m), from the first score on."
-
-
-def _levels(calibration: ScoreCalibration) -> Iterator[str]:
-    """Yield how many more logs the next levels take."""
-    recordings, kind = calibration.calibration.recording_count, calibration.calibration.kind
-    if calibration.needed:
-        yield f"{counted(calibration.needed, 'more healthy log(s)')} would keep it."
-    for level in LEVELS.values():
+    whole = "" if calibration.whole else " Logs that no window cuts would promise it of whole logs."
+    yield f"{calibration.promise[0].upper()}{calibration.promise[1:]}.{whole}"
+    n, basis, kind = calibration.units, calibration.calibration, calibration.calibration.kind
+    if interval := calibration.share_interval:
+        scaling = ", others scale it" if kind == "cusum" else ""
+        yield (
+            f"The true share at this threshold is {_percent(*interval)} (95 % interval, from {n} "
+            f"healthy logs{scaling})."
+        )
+    for level in (level for level in LEVELS.values() if level <= calibration.level):
         least = least_episodes(level, kind)
-        if level < calibration.level and least > recordings:
-            more = least - recordings
+        if more := max(0, least - basis.recording_count):
             yield f"{100 * level:g} % takes {least} healthy logs, {more} more."
-            return
+            break
+    largest, share = calibration.sweep
+    margin = " A margin on top lets fewer trip: how many fewer, healthy logs do not tell."
+    yield (
+        f"A hand sweep until none of these {counted(n, 'log(s)')} trips stops at "
+        f"{_rounded_up(largest)}, and lets {100 * share:.3g} % (1/{n + 1}) of further healthy logs "
+        f"trip on average.{margin * (largest > 0)}"
+    )
+    test = calibration.drift
+    steady = f"No drift seen (rank correlation {test.statistic:.2f}, p = {test.p:.2g})."
+    yield from calibration.notes or [steady]
+    if calibration.healthy:
+        alarms, n = calibration.false_alarms, calibration.healthy
+        shares = _percent(*clopper_pearson(alarms, n))
+        yield f"Of {counted(n, 'further healthy log(s)')} {alarms} alarm (95 % interval {shares})."
+    yield from map(_detected, calibration.detections)
+
+
+def _percent(low: float, high: float) -> str:
+    return f"{100 * low:.2g} to {100 * high:.2g} %"
 
 
 def _detected(row: Detections) -> str:
@@ -154,61 +122,25 @@ def by_group(calibration: ScoreCalibration, name: str, unit: str) -> Iterator[st
     """
     for group, row in calibration.groups.items():
         line = condition(row.calibration, name, unit) if row.calibration else row.problem
-        low, high = (100 * share for share in clopper_pearson(row.above, row.episodes))
+        shares = _percent(*clopper_pearson(row.above, row.episodes))
         yield (
             f"{group}: {line} (pooled, {row.above} of its {row.episodes} healthy logs alarm: "
-            f"{low:.2g} to {high:.3g} %)"
+            f"{shares})"
         )
 
 
-def as_json(calibration: ScoreCalibration, name: str, unit: str) -> dict[str, Any]:
-    """Return all that is known of a threshold as values for JSON.
+def as_json(calibration: ScoreCalibration) -> dict[str, Any]:
+    """Return all that is known of a threshold as values for JSON, NaN among them.
 
     Parameters
     ----------
     calibration
         The threshold.
-    name, unit
-        Of the score.
-
-    Returns
-    -------
-    dict
-        Without numbers that are not finite.
     """
-    largest, share = calibration.sweep
-    scale = calibration.rule.standardization
-    return {
-        "score": name,
-        "unit": unit,
-        "threshold": calibration.threshold,
-        "alarm": calibration.alarm,
-        "hold": calibration.hold,
-        "smoothing": calibration.smoothing,
-        "standardization": scale.numbers if scale else None,
-        "level": calibration.level,
-        "promise": calibration.promise,
-        "share_interval": calibration.share_interval,
-        "logs": calibration.calibration.episodes,
-        "recordings": calibration.calibration.recording_count,
-        "threshold_from": calibration.units,
-        "needed": calibration.needed,
-        "longest_gap": calibration.longest_gap,
-        "sweep": {"threshold": largest, "share": share},
-        "drift": {"correlation": calibration.drift.statistic, "p": calibration.drift.p},
-        "notes": calibration.notes,
-        "healthy": {"logs": calibration.healthy, "alarms": calibration.false_alarms},
-        "detections": [
-            row._asdict() | {"delay": None if math.isnan(row.delay) else row.delay}
-            for row in calibration.detections
-        ],
-        "groups": {
-            group: {
-                "logs": row.episodes,
-                "above_pooled": row.above,
-                "problem": row.problem,
-                "calibration": as_json(row.calibration, name, unit) if row.calibration else None,
-            }
-            for group, row in calibration.groups.items()
-        },
+    names = ("threshold", "smoothing", "promise", "share_interval", "units", "needed", "sweep")
+    properties = {name: getattr(calibration, name) for name in (*names, "notes")}
+    groups = {
+        name: asdict(group) | {"calibration": group.calibration and as_json(group.calibration)}
+        for name, group in calibration.groups.items()
     }
+    return asdict(calibration) | properties | {"groups": groups}

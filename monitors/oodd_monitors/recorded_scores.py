@@ -5,7 +5,7 @@ import tomllib
 from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,18 +15,10 @@ from oodd_logs.inspection.logs import inspect_logs, recognised
 from oodd_logs.kinds.missing_codes import KEY as MISSING_CODES
 from oodd_logs.readers import in_order
 from oodd_logs.recipe import Recipe
-from oodd_logs.selecting import split_unit
 
 from oodd_eval.data.facts import Quantity
 from oodd_eval.data.layout import MANIFEST
-from oodd_eval.data.parts import (
-    CALIBRATION,
-    TRAIN,
-    AnomalousSet,
-    EnvironmentData,
-    LabelledSet,
-    TrajectorySet,
-)
+from oodd_eval.data.parts import CALIBRATION, TRAIN, AnomalousSet, TrajectorySet
 from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import TrajectoryError, UsageError
 from oodd_eval.names import counted, listed
@@ -40,17 +32,7 @@ _SIGNED: Final = re.compile(r"(-?)(?:\|(?P<a>.+)\||abs\((?P<b>.+)\)|(?P<c>.+))")
 
 
 class ScoreColumn(NamedTuple):
-    """The column that a score is, and its sign.
-
-    Attributes
-    ----------
-    name
-        Of the column.
-    sign
-        1, or -1 where small values are unusual.
-    size
-        Whether its absolute value is the score.
-    """
+    """The column that a score is, its sign, and whether its absolute value is taken."""
 
     name: str
     sign: int
@@ -74,6 +56,13 @@ class ScoreColumn(NamedTuple):
         scores = self.sign * (np.abs(values) if self.size else values)
         scores[:baseline] = np.nan
         return scores
+
+    def number(self, sensors: Sequence[Quantity]) -> int:
+        """Return which of some columns it is; the only one may have another name."""
+        names = [sensor.name for sensor in sensors]
+        if self.name not in names and len(names) > 1:
+            raise UsageError(f"{self.name!r} names {len(names)}, {listed(names)}: expected one")
+        return names.index(self.name) if self.name in names else 0
 
 
 @dataclass(slots=True)
@@ -105,6 +94,12 @@ class RecordedScores:
     healthy: list[Floats] = field(default_factory=list)
     labelled: list[LabelledScores] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Those of `calibrate`."""
+        names = ("scores", "recordings", "labelled", "healthy", "groups")
+        return {name: getattr(self, name) for name in names}
 
 
 def read_scores(
@@ -142,18 +137,13 @@ def read_scores(
 def _of_logs(path: Path, column: ScoreColumn, recipe_file: Path | None, per: str) -> RecordedScores:
     """Read a column of logs."""
     recipe, root, files = _recipe_and_files(path, recipe_file)
-    recipe = replace(
-        recipe,
-        sensors=_texts_of(recipe, column.name),
-        scores=(),
-        actions=(),
-        reward="",
-        discrete=0,
-        gap=_NEVER,
-        roles={},
-        columns={k: codes for k, codes in recipe.columns.items() if k == MISSING_CODES},
-        task=per or recipe.task,
-    )
+    codes = {key: value for key, value in recipe.columns.items() if key == MISSING_CODES}
+    others: dict[str, Any] = {"scores": (), "actions": (), "reward": "", "discrete": 0}
+    others |= {"roles": {}, "blocks": {}, "columns": codes, "gap": _NEVER}
+    others |= {"task": per} if per else {}
+    renaming = re.compile(re.escape(column.name) + r"\s*(\[.*\])?\s*=")
+    renamed = tuple(filter(renaming.match, (*recipe.sensors, *recipe.scores)))
+    recipe = replace(recipe, sensors=renamed[:1] or (column.name,), **others)
     try:
         with read_every_episode(recipe, root, files) as source:
             return _of_episodes(source, column, recipe.baseline, per)
@@ -162,56 +152,30 @@ def _of_logs(path: Path, column: ScoreColumn, recipe_file: Path | None, per: str
         raise UsageError(f"{error}. {advice}") from None
 
 
-def _texts_of(recipe: Recipe, name: str) -> tuple[str, ...]:
-    """Return what a recipe's sensors have to be so that the column of a name is among them."""
-    block = re.sub(r"\[\d+\]$", "", name)
-    if block in recipe.blocks:
-        return recipe.blocks[block]
-    texts = (text for text in (*recipe.sensors, *recipe.scores) if "=" in text)
-    renamed = (text for text in texts if split_unit(text.partition("=")[0])[0] == name)
-    return (next(renamed, name),)
-
-
 def _recipe_and_files(path: Path, recipe_file: Path | None) -> tuple[Recipe, Path, list[Path]]:
     """Return how logs are read, the folder that files are relative to, and the files."""
     if recipe_file or path.suffix == ".toml":
         recipe = Recipe.load(recipe_file or path)
-        roots = dict.fromkeys([path if path.is_dir() else path.parent])
-        roots |= {recipe_file.parent: None} if recipe_file else {}
-        root, matched = next(
-            ((root, files) for root in roots if (files := _files_of(recipe, root))), (path, [])
-        )
-        if not matched:
-            raise UsageError(
-                f"no file in {str(root)!r} matches {listed(recipe.globs)} of the recipe: say which "
-                "folder they are in, as in calibrate FOLDER --recipe FILE"
-            )
-        return recipe, root, matched
+        for root in (path if path.is_dir() else path.parent, (recipe_file or path).parent):
+            files = {*files_of(recipe, root)} - {root / str(recipe.intervals)}
+            if files:
+                return recipe, root, sorted(files, key=lambda file: in_order(file.as_posix()))
+        expected = f"a file that matches {listed(recipe.globs)}: calibrate FOLDER --recipe FILE"
+        raise UsageError(f"{str(root)!r} holds no log of the recipe, expected {expected}")
     logs = inspect_logs(path)
-    recipe = Recipe.parse(tomllib.loads(draft(logs)))
-    recipe = replace(recipe, window=0, rate=None)
-    files = recognised(path, recipe.format)[1]
-    root = path if path.is_dir() and files != [path] else path.parent
+    recipe = replace(Recipe.parse(tomllib.loads(draft(logs))), window=0, rate=None)
+    recordings = recognised(path, recipe.format)[1]
+    root = path if path.is_dir() and recordings != [path] else path.parent
     copies = {root / name for same in logs.equal for name in same[1:]} | {root / logs.intervals}
-    return recipe, root, [file for file in files if file not in copies]
+    return recipe, root, [file for file in recordings if file not in copies]
 
 
-def _files_of(recipe: Recipe, root: Path) -> list[Path]:
-    """Return the files of recordings that a recipe lists, in natural order."""
-    files = {*files_of(recipe, root)}
-    if isinstance(recipe.intervals, str):
-        files.discard(root / recipe.intervals)
-    return sorted(files, key=lambda file: in_order(file.as_posix()))
-
-
-def _of_episodes(
-    source: EpisodeSource, column: ScoreColumn, baseline: int, per: str
-) -> RecordedScores:
+def _of_episodes(source: EpisodeSource, column: ScoreColumn, base: int, per: str) -> RecordedScores:
     """Return the scores of the episodes of logs."""
-    number = _number_of(column.name, source.sensors)
+    number = column.number(source.sensors)
     result, silent = RecordedScores(source.sensors[number].unit), []
     for i, episode in enumerate(source.episodes(EVERY)):
-        scores = column(episode.observations[:, number].copy(), baseline)
+        scores = column(episode.observations[:, number].copy(), base)
         if np.isnan(scores).all():
             silent.append(episode.name)
         elif episode.kind or episode.intervals:
@@ -225,14 +189,6 @@ def _of_episodes(
         raise UsageError(f"no healthy log has a field or column {per!r}, which --per names")
     result.notes += _notes(source, result, silent)
     return result
-
-
-def _number_of(name: str, sensors: Sequence[Quantity]) -> int:
-    """Return the number of the column of a name, or of the only one that a glob names."""
-    names = [sensor.name for sensor in sensors]
-    if name not in names and len(names) > 1:
-        raise UsageError(f"{name!r} names {len(names)} columns ({listed(names)}): name one")
-    return names.index(name) if name in names else 0
 
 
 def _notes(source: EpisodeSource, scores: RecordedScores, silent: Sequence[str]) -> Iterator[str]:
@@ -254,35 +210,27 @@ def _of_split(split: Split, column: ScoreColumn, per: str) -> RecordedScores:
         raise UsageError(f"{split.name} has several environments, {names}: expected one")
     if per not in {"", "task"}:
         raise UsageError(f"--per {per}: a split keeps no field but the task, so --per task")
-    whole = split.environment(split.environments[0])
-    data = whole.of_columns([column.name])
-    result = RecordedScores(data.sensors[_number_of(column.name, data.sensors)].unit)
-    for part, episodes in ((TRAIN, data.train), (CALIBRATION, data.calibration)):
-        recordings = data.recordings(part) or [(part, i) for i in range(len(episodes))]
-        result.scores += _scores_in(data, column, episodes)
-        result.recordings += recordings
-        result.groups += episodes.tasks if per else ()
-    result.healthy += _scores_in(data, column, data.twins)
-    for anomaly in data.anomalies:
-        episodes = data.test_set(anomaly)
-        for i, scores in enumerate(_scores_in(data, column, episodes)):
-            intervals: Sequence[tuple[int, int]] = ()
-            if isinstance(episodes, LabelledSet):
-                intervals = episodes.intervals[i]
-            elif isinstance(episodes, AnomalousSet):
-                intervals = [(int(episodes.effects[i]), len(scores))]
-            result.labelled.append(LabelledScores(scores, intervals, anomaly))
-    result.notes.append(
-        f"Healthy: {len(data.train)} training and {len(data.calibration)} calibration episodes, as "
-        "nothing is fitted; `run` takes the latter alone."
-    )
-    return result
-
-
-def _scores_in(data: EnvironmentData, column: ScoreColumn, episodes: TrajectorySet) -> list[Floats]:
-    """Return the scores of the episodes of a part, in the unit of the logs."""
+    data = split.environment(split.environments[0]).of_columns([column.name])
+    result = RecordedScores(data.sensors[column.number(data.sensors)].unit)
     offset = data.logs.offsets[0] if data.logs and data.logs.offsets else 0.0
-    return [
-        column(trajectory.observations[:, 0].astype(np.float64) + offset, data.baseline)
-        for trajectory in episodes
-    ]
+
+    def scores_in(episodes: TrajectorySet) -> list[Floats]:
+        columns = (x.observations[:, 0].astype(np.float64) + offset for x in episodes)
+        return [column(values, data.baseline) for values in columns]
+
+    for part, episodes in ((TRAIN, data.train), (CALIBRATION, data.calibration)):
+        result.scores += scores_in(episodes)
+        result.recordings += data.recordings(part) or [(part, i) for i in range(len(episodes))]
+        result.groups += episodes.tasks if per else ()
+    result.healthy += scores_in(data.twins)
+    for anomaly in data.anomalies:
+        episodes = data.anomalous(anomaly) if data.paired else data.labelled(anomaly)
+        intervals: Sequence[Any] = getattr(episodes, "intervals", ())
+        if isinstance(episodes, AnomalousSet):
+            intervals = [((start, start + 1),) for start in episodes.effects.tolist()]
+        pairs = zip(scores_in(episodes), intervals, strict=True)
+        result.labelled += [LabelledScores(*pair, anomaly) for pair in pairs]
+    n, m = len(data.train), len(data.calibration)
+    text = f"Healthy: {n} training and {m} calibration episodes, as nothing is fitted"
+    result.notes.append(f"{text}; `run` calibrates with the latter alone.")
+    return result

@@ -6,7 +6,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from oodd_monitors import LabelledScores, calibrate
+from oodd_monitors import Detections, LabelledScores, calibrate
 
 from oodd_eval.errors import TrajectoryError, UnknownNameError, UsageError
 
@@ -111,8 +111,8 @@ def test_a_cusum_is_scaled_by_every_second_log():
     assert calibration.threshold == pytest.approx(max(max(sums(s)) for s in logs[1::2]))
     assert calibration.statistic(logs[7]) == pytest.approx([*sums(logs[7])])
     message = (
-        r"37 healthy logs, too few for 5 %: a CUSUM, half of which scale it, needs 38, 1 more; "
-        r"--alarm threshold or ewma works.*--level 5\.3"
+        r"37 healthy logs, too few for 5 %: the alarm cusum needs 38, 1 more; threshold and ewma "
+        r"do not; these allow 5\.3 % \(--level 5\.3\)"
     )
     with pytest.raises(UsageError, match=message):
         calibrate(logs[:37], 0.05, alarm="cusum")
@@ -132,8 +132,10 @@ def test_windows_of_one_recording_count_once():
 
 
 def test_too_few_logs_are_told_how_many_more_and_what_they_allow():
-    with pytest.raises(UsageError, match=r"3 healthy logs, too few for 5 %: a threshold needs 19, "
-                       r"16 more; these allow 25 % \(--level 25\)"):  # fmt: skip
+    few = (
+        r"3 healthy logs, too few for 5 %: the alarm threshold needs 19, 16 more; these allow 25 %"
+    )
+    with pytest.raises(UsageError, match=few + r" \(--level 25\)"):
         calibrate(logs_of([1, 2, 3]))
     assert calibrate(logs_of([1, 2, 3]), 0.25).threshold == 3
     # What a message allows is allowed.
@@ -167,8 +169,8 @@ def test_labelled_logs_tell_what_a_threshold_detects():
         healthy=[[0, 1], [0, 50], [3, 4]],
     )
     slip, jam, plain = calibration.detections
-    assert slip == ("slip", 4, 1, 2, 1, 2.0, 1)
-    assert jam[:5] == ("jam", 1, 0, 1, 0)
+    assert slip == Detections("slip", 4, early=1, detected=2, missed=1, delay=2.0, in_time=1)
+    assert (jam.kind, jam.episodes, jam.early, jam.detected, jam.missed) == ("jam", 1, 0, 1, 0)
     assert math.isnan(jam.delay)
     assert (plain.kind, plain.detected, plain.in_time) == ("anomalous", 1, 0)
     assert (calibration.false_alarms, calibration.healthy) == (1, 3)
@@ -183,7 +185,9 @@ def test_groups_have_thresholds_of_their_own_and_pooling_is_judged():
     assert (small.calibration.threshold, small.above) == (10, 0)
     assert (large.calibration.threshold, large.above) == (110, 0)
     assert (new.calibration, new.above, new.episodes) == (None, 1, 2)
-    assert new.problem.startswith("2 healthy logs, too few for 10 %: a threshold needs 9, 7 more")
+    assert new.problem.startswith(
+        "2 healthy logs, too few for 10 %: the alarm threshold needs 9, 7 more"
+    )
     with pytest.raises(UsageError, match="1 groups of 22 episodes"):
         calibrate(logs_of(peaks), 0.10, groups=["small"])
 
@@ -191,16 +195,28 @@ def test_groups_have_thresholds_of_their_own_and_pooling_is_judged():
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
-        ({"scores": [[0.0, 1.0]] * 20}, UsageError, "only the values 0 and 1.*flag:NAME"),
-        ({"scores": [[3.0, 3.0]] * 20}, UsageError, "is 3 in all rows of all 20 healthy logs"),
-        ({"scores": [[1.0, 2.0, 3.0], [math.nan] * 2]}, UsageError, "episode 1 has no score"),
+        ({"scores": [[0.0, 1.0]] * 20}, UsageError, "0 or 1 in all rows .*flag:NAME"),
+        ({"scores": [[3.0, 3.0]] * 20}, UsageError, "is 3 in all rows of 20 healthy logs"),
+        (
+            {"scores": [[1.0, 2.0, 3.0], [math.nan] * 2]},
+            UsageError,
+            r"episode 1 .*\(2,\), expected a number a row, in 1 rows",
+        ),
         ({"scores": [[1.0, 2.0], [[3.0]]]}, UsageError, r"episode 1 has scores of shape \(1, 1\)"),
         ({"scores": [["on", "off"]]}, TrajectoryError, "episode 0 of the scores: .*no real number"),
         ({"scores": LOGS, "level": 5}, UsageError, "level=5, expected a share"),
         ({"scores": LOGS, "alarm": "cosum"}, UnknownNameError, "did you mean 'cusum'"),
         ({"scores": LOGS, "hold": 0}, UsageError, "whole number of at least 1"),
-        ({"scores": LOGS, "hold": 4}, UsageError, "fewer than 4 rows with a score"),
-        ({"scores": [[1, math.inf]] * 20 + LOGS}, UsageError, "20 of 60 healthy logs .* infinite"),
+        (
+            {"scores": LOGS, "hold": 4},
+            UsageError,
+            r"episode 0 .*\(3,\), expected .* in 4 rows at least",
+        ),
+        (
+            {"scores": [[1, math.inf]] * 20 + LOGS},
+            UsageError,
+            "20 of the 60 calibration episodes .* infinite",
+        ),
         ({"scores": []}, UsageError, "0 healthy logs, too few for 5 %"),
     ],
 )
