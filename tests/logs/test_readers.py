@@ -1237,7 +1237,7 @@ def test_lines_of_json_by_another_name_are_read(tmp_path):
 def test_a_format_says_by_what_it_is_recognised():
     known = readers()
     assert {*known} == {"csv", "text", "json", "jsonl", "parquet", "lerobot", "mcap", "rosbag",
-                        "ulog", "mat", "hdf5", "numpy", "minari"}  # fmt: skip
+                        "ulog", "ardupilot", "mat", "hdf5", "numpy", "minari"}  # fmt: skip
     endings = [suffix for reader in known.values() for suffix in reader.suffixes]
     assert len(endings) == len({*endings})
     assert all(reader.suffixes or reader.directory_markers for reader in known.values())

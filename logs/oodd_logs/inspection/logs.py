@@ -65,7 +65,8 @@ _SCORE: Final = re.compile(
     r"innov|residual|test.?ratio|uncertain|disagreement|epistemic|mahalanobis|likelihood"
     r"|(?:pred|recon|chunk|forecast|model)[a-z]*[^a-z]?err"
     r"|(?:^|[^a-z])(?:scores?|mse|rmse|mae|mmd|nis|nees|nll|ood|novelty|surprise|entropy|chi2)"
-    r"(?:$|[^a-z])",
+    r"(?:$|[^a-z])"
+    r"|[NX]KF3(?:_\d+)?\.I[MPVY]|[NX]KF4(?:_\d+)?\.S[HMPV]",  # ArduPilot's innovations and ratios
     re.IGNORECASE,
 )
 _VARIANCE: Final = re.compile(r"variance|(?:^|[^a-z])var(?:$|[^a-z])", re.IGNORECASE)
@@ -672,8 +673,9 @@ def recognised(path: Path, form: str) -> tuple[Reader, list[Path], Counter[str]]
             f"{str(path)!r} has no files of a known format, expected names that end in {endings}; "
             "--format says which it is"
         )
-    # Beside logs, JSON files hold settings.
-    name = max(by_reader, key=lambda reader: (reader != "json", len(by_reader[reader])))
+    # Beside logs, JSON files hold settings, and .bin anything.
+    others = {"json", "ardupilot"}
+    name = max(by_reader, key=lambda reader: (reader not in others, len(by_reader[reader])))
     read = {*by_reader[name]}
     return formats[name], by_reader[name], Counter(f.suffix for f in files if f not in read)
 
