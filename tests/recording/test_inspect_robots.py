@@ -43,7 +43,7 @@ def module():
 def page(module, tmp_path_factory):
     """What the code of the page leaves behind, and the folder in which it ran."""
     folder = tmp_path_factory.mktemp("page")
-    record, judge = python_blocks(README)
+    record, *judge = python_blocks(README)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         patch.setenv("OODD_EVAL_DATA", str(folder / "splits"))
@@ -52,20 +52,40 @@ def page(module, tmp_path_factory):
         recipe = re.search(r"```toml\n(.*?)```", README, re.DOTALL)[1]
         (folder / "cube.toml").write_text(recipe)
         assert main(["data", "import", "cube.toml"]) == 0
-        exec(judge.replace("print(", "printed.append("), space)  # noqa: S102 - the same
+        exec("\n".join(judge).replace("print(", "printed.append("), space)  # noqa: S102 - the same
     return SimpleNamespace(folder=folder, **space)
 
 
 def test_the_page_prints_what_the_scorers_find(page):
-    (shown,) = re.findall(r"```text\n(.*?)```", README, re.DOTALL)
+    shown = "".join(re.findall(r"```text\n(.*?)```", README, re.DOTALL))
     # On another processor an alarm may come a row sooner or later.
     lines = [pytest.approx(ast.literal_eval(line), abs=0.1) for line in shown.splitlines()]
     assert page.printed == lines
-    healthy, weak = page.printed
-    assert healthy["success_at_end"] == weak["success_at_end"] == 1
-    assert healthy["oodd_alarm"] <= 0.05 < weak["oodd_alarm"]
-    # The first changed observation is that of row 4.
-    assert 4 <= weak["oodd_quiet_rows"] < healthy["oodd_quiet_rows"]
+    assert all(metrics["success_at_end"] == 1 for metrics in page.printed)
+    for healthy, weak in (page.printed[:2], page.printed[2:]):
+        assert healthy["oodd_alarm"] <= 0.05 < weak["oodd_alarm"]
+        assert weak["oodd_quiet_rows"] < healthy["oodd_quiet_rows"]
+    # The first changed observation of the first robot is that of row 4.
+    assert page.printed[1]["oodd_quiet_rows"] >= 4
+
+
+def test_the_command_finds_the_threshold_that_the_page_finds(page, capsys):
+    assert main(["calibrate", str(page.folder / "worn.jsonl"), "--score", "missed"]) == 0
+    assert f"missed > {page.monitor.rule.threshold:.5g}" in capsys.readouterr().out
+
+
+def test_a_column_is_judged_row_by_row(page, module, monkeypatch):
+    """The row of the alarm is the first whose number is above the threshold."""
+    page.monitor.save(page.folder / "missed.npz")
+    monkeypatch.setenv("OODD_WATCHDOG", str(page.folder / "missed.npz"))
+    monkeypatch.setenv("OODD_COLUMN", "missed")
+    scorer = module.quiet_rows()
+    for seed in range(5):
+        record = trial(page, page.Worn(0.9, seed))
+        missed = [
+            row.get("missed", -1) > page.monitor.rule.threshold for row in module.rows(record)
+        ]
+        assert scorer(record, None).value == (missed.index(True) if any(missed) else len(missed))
 
 
 def test_a_file_of_trials_has_each_of_them_with_its_outcome(page):
