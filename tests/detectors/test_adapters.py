@@ -4,6 +4,7 @@ import sys
 
 import numpy as np
 import pytest
+import torch
 from oodd_adapters import windows as w
 from river import anomaly as river_anomaly
 from river import preprocessing
@@ -211,6 +212,32 @@ def test_a_detector_that_ranks_rows_among_each_other_gets_them_one_at_a_time():
     np.testing.assert_array_equal(detector.score(x)[:5], detector.score(x[:5]))
 
 
+@pytest.mark.parametrize("name", ["pyod:AutoEncoder", "pyod:VAE"])
+def test_networks_of_pyod_are_quiet_repeatable_and_causal(name, capfd):
+    nominal, (x,) = noise(60, 60), noise(20, seed=1)
+    before = torch.random.get_rng_state()
+    settings = [{"seed": seed, "window": 1, "epoch_num": 2} for seed in (1, 1, 2)]
+    first, again, other = (make(name, **s).fit(nominal).score(x) for s in settings)
+    np.testing.assert_array_equal(first, again)
+    assert not np.array_equal(first, other)
+    np.testing.assert_array_equal(first[:7], make(name, **settings[0]).fit(nominal).score(x[:7]))
+    assert capfd.readouterr() == ("", "")
+    assert torch.equal(before, torch.random.get_rng_state())
+    assert not {"verbose", "device"} & parameters_of(offer(name).spec.parameters).keys()
+
+
+def test_anogan_of_pyod_compares_all_rows_with_one_generated_row():
+    """The reason why it is not offered: the day this fails, it may be."""
+    anogan = pytest.importorskip("pyod.models.anogan")
+    rng = np.random.default_rng(0)
+    model = anogan.AnoGAN(epochs=1, epochs_query=1).fit(rng.normal(size=(40, 3)))
+    with torch.no_grad():
+        _, generated, answer = model.query_model.eval()(torch.zeros(1, 2))
+        rows = torch.from_numpy(rng.normal(size=(5, 3))).float()
+        far = (rows - generated).abs().mean(1) + (model.discriminator(rows) - answer).abs()[:, 0]
+    np.testing.assert_allclose(model.decision_function(rows.numpy()), far.numpy(), rtol=1e-5)
+
+
 # Online detectors
 
 
@@ -368,6 +395,7 @@ def test_the_code_of_a_users_forecaster_is_part_of_the_version(theirs):
     [
         ("pyod:iforest", UnknownNameError, "did you mean 'IForest'"),
         ("pyod:os.system", UnknownNameError, "unknown detector of PyOD"),
+        ("pyod:AnoGAN", UsageError, "one and the same generated row"),
         ("sklearn:linear_model.Ridge", UsageError, "neither an outlier detector nor"),
         ("sklearn:ensembl.IsolationForest", UnknownNameError, "did you mean 'ensemble'"),
         ("river:HalfspaceTrees", UnknownNameError, "did you mean 'HalfSpaceTrees'"),
@@ -388,6 +416,15 @@ def test_a_name_that_leads_nowhere_says_what_is_wrong(name, error, message):
     with pytest.raises(error) as caught:
         offer(name)
     assert message in str(caught.value)
+
+
+def test_a_class_of_pyod_that_needs_torch_says_so_and_nothing_else(monkeypatch, capfd):
+    for module in [m for m in sys.modules if m.partition(".")[0] == "torch" or "pyod.models" in m]:
+        monkeypatch.delitem(sys.modules, module)
+    monkeypatch.setitem(sys.modules, "torch", None)
+    spec = offer("pyod:AutoEncoder").spec
+    assert spec.requires == ("torch",)
+    assert capfd.readouterr() == ("", "")
 
 
 def test_a_module_that_needs_another_one_says_which(theirs):

@@ -165,8 +165,8 @@ class OutlierDetector(_Adapter):
         self.method, self.sign = method, sign
 
     def _fit_class(self, rows: Floats, later: Floats) -> None:  # noqa: ARG002  nothing is predicted
-        model = self.make()
-        with seeded(self.seed):
+        with seeded(self.seed):  # also the constructor, which may seed the global generators
+            model = self.make()
             model.fit(rows)
         call = self._seeded_call(getattr(model, self.method))
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import io
 import json
 import math
 import re
 from collections.abc import Callable, Mapping
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -25,7 +27,8 @@ def pyod_class(name: str) -> type:
     """Return a detector class of ``pyod.models`` by its bare name.
 
     Only the module that defines it is imported: others need libraries of their own. Raises
-    `UnknownNameError` when there is no such class.
+    `UnknownNameError` when there is no such class, and `UsageError` for one that does not compute
+    what it is named after.
     """
     places: dict[str, str] = {}
     directory = _directory("pyod.models")
@@ -35,8 +38,20 @@ def pyod_class(name: str) -> type:
                 places.setdefault(defined, file.stem)
     if name not in places:
         raise UnknownNameError("detector of PyOD", name, places)
-    outlier_class = getattr(importlib.import_module(f"pyod.models.{places[name]}"), name)
+    if reason := _NOT_ITSELF.get(name):
+        raise UsageError(f"'pyod:{name}' {reason}")
+    with redirect_stdout(io.StringIO()):  # some print that torch is missing, and then raise
+        module = importlib.import_module(f"pyod.models.{places[name]}")
+    outlier_class = getattr(module, name)
     return _class(outlier_class, f"pyod:{name}", "fit", "decision_function")
+
+
+_NOT_ITSELF: Final = {
+    "AnoGAN": "is not offered: up to PyOD 3.6.7 its decision_function searches no latent vector of "
+    "a row, and compares all rows with one and the same generated row; pyod:AutoEncoder and "
+    "pyod:VAE reconstruct each row",
+}
+"""Classes of PyOD whose scores are not those of the method in their names."""
 
 
 def sklearn_class(name: str) -> tuple[str, type]:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from importlib.metadata import version
 from importlib.util import find_spec
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final
 
 from oodd_adapters.detectors import (
     AdapterParameters,
@@ -29,6 +29,9 @@ from oodd_eval.scoring.plan import source_digest
 
 _WINDOW_PARAMETERS = frozenset(f.name for f in fields(AdapterParameters))
 
+_PYOD: Final = {"verbose": 0, "device": "cpu"}
+"""Values for classes of PyOD with other defaults: they draw bars, and take a GPU where one is."""
+
 
 def pyod(name: str) -> DetectorSpec:
     """Return the spec of a detector of PyOD: its `decision_function` on windows."""
@@ -39,7 +42,9 @@ def pyod(name: str) -> DetectorSpec:
         library_class = pyod_class(name)
     except ModuleNotFoundError as error:
         return _absent(f"pyod:{name}", summary, str(error.name), "")
-    recipe = _Recipe(library_class, f"pyod:{name}", outlier=("decision_function", 1))
+    plain = Signature.of(library_class).plain
+    decided = {n: v for n, v in _PYOD.items() if plain.get(n, v) != v}
+    recipe = _Recipe(library_class, f"pyod:{name}", ("decision_function", 1), decided)
     return recipe.spec(summary, f"pyod.{version('pyod')}")
 
 
