@@ -1,8 +1,9 @@
 r"""Write what docs/failures.md is made from: records of rows on rollouts of a learned policy.
 
-``python docs/figures/failures.py --root DIR --results DIR [--detector mewma]``: the root is the folder
-of the recipe `pi0-failures`. Rows are run within tasks, as the recipe has them, and on each task in turn
-that training has not seen: there all episodes of the other tasks are for training and calibration.
+``python docs/figures/failures.py --root DIR --results DIR [--detector mewma]``: the root is the
+folder of the recipe `pi0-failures`. Rows are run within tasks, as the recipe has them, and on each
+task in turn that training has not seen: there all episodes of the other tasks are for training and
+calibration.
 A second call goes on where the first was interrupted.
 """
 

@@ -355,9 +355,9 @@ class EnvironmentData:
             When there is no such column.
         """
         numbers = [i for name in names for i in columns_named(self.columns, name, self.id)]
-        shown = copy.copy(self)
-        shown._show(numbers)  # noqa: SLF001  of this class
-        return shown
+        view = copy.copy(self)
+        view._show(numbers)  # noqa: SLF001  of this class
+        return view
 
     def _show(self, columns: list[int] | None) -> None:
         """Let episodes have some of the stored columns as their sensors; None for all."""

@@ -49,7 +49,7 @@ def pyod_class(name: str) -> type:
 _NOT_ITSELF: Final = {
     "AnoGAN": "is not offered: up to PyOD 3.6.7 its decision_function searches no latent vector of "
     "a row, and compares all rows with one and the same generated row; pyod:AutoEncoder and "
-    "pyod:VAE reconstruct each row",
+    "pyod:VAE reconstruct each row"
 }
 """Classes of PyOD whose scores are not those of the method in their names."""
 
