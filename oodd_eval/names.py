@@ -15,7 +15,7 @@ Value = TypeVar("Value")
 Read = TypeVar("Read")
 
 DETECTOR_NAME: Final = r"[a-z0-9][a-z0-9-]{0,63}"
-COLUMN_NAME: Final = r"[-\w/][-+\w ./%()\[\]]{0,119}"
+COLUMN_NAME: Final = r"[\w/][-+\w ./%()\[\]]{0,119}"
 """What a column of logs is called where it is named as a detector, without its sign."""
 
 SPEC_NAME: Final = DETECTOR_NAME + r"(:[-\w/][-+\w ./%()\[\]]{0,127})?"

@@ -129,9 +129,10 @@ def log_rows(data: EnvironmentData) -> Rows:
     Intervals and anomalous rows are those of episodes with intervals, of whose rows the share is.
     """
     rows = []
-    failed = [data.failures] if data.failures is not None else []
     tests = data.twins, *map(data.labelled, data.anomalies)
-    for part in (data.train, *failed, data.calibration, *tests):
+    for part in (data.train, data.failures, data.calibration, *tests):
+        if part is None:
+            continue
         labels = ["", "", ""]
         if isinstance(part, LabelledSet):
             labelled = [(i, spans) for i, spans in enumerate(part.intervals) if spans]

@@ -59,8 +59,13 @@ class TrajectorySet(TrajectorySequence):
         Seeds of the environment, int64 of shape (n,).
     """
 
-    def __init__(self, parts: Mapping[str, Mapping[str, Any]], group: str) -> None:
-        self._data = parts[group]
+    def __init__(
+        self,
+        parts: Mapping[str, Mapping[str, Any]],
+        group: str,
+        columns: list[int] | slice = slice(None),
+    ) -> None:
+        self._data, self._columns = parts[group], columns
         self.group = group
         self._offsets: NDArray[np.int64] = self._data["offsets"][:]
         self.lengths: NDArray[np.int64] = np.diff(self._offsets)
@@ -96,7 +101,8 @@ class TrajectorySet(TrajectorySequence):
         observations, actions = observations[first + start : last + stop], actions[first:last]
         for i in range(start, stop):
             a, b = self._offsets[i : i + 2] - first
-            yield Trajectory(observations[a + i - start : b + i - start + 1], actions[a:b])
+            rows = observations[a + i - start : b + i - start + 1, self._columns]
+            yield Trajectory(rows, actions[a:b])
 
     def rewards(self, index: int) -> NDArray[np.float32]:
         """Return the rewards of trajectory number `index`, float32 of shape (T,)."""
@@ -147,8 +153,8 @@ class LabelledSet(TrajectorySet):
         known. An episode without intervals is known by its outcome alone.
     """
 
-    def __init__(self, parts: Mapping[str, Mapping[str, Any]], group: str) -> None:
-        super().__init__(parts, group)
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
         bounds = itertools.pairwise(self._data["interval_offsets"][:].tolist())
         rows = list(map(tuple, self._data["intervals"][:].tolist()))
         self.intervals: list[tuple[Interval, ...]] = [tuple(rows[a:b]) for a, b in bounds]
@@ -167,8 +173,8 @@ class AnomalousSet(TrajectorySet):
         Numbers of draws that were rejected, int64 of shape (n,).
     """
 
-    def __init__(self, parts: Mapping[str, Mapping[str, Any]], group: str) -> None:
-        super().__init__(parts, group)
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
         self.onsets: NDArray[np.int64] = self._data["onsets"][:]
         self.effects: NDArray[np.int64] = self._data["effects"][:]
         self.redraws: NDArray[np.int64] = self._data["redraws"][:]
@@ -247,18 +253,6 @@ def check_twins(
             )
 
 
-class _Columns:
-    """Some columns of stored rows."""
-
-    def __init__(self, rows: Any, columns: list[int]) -> None:
-        self._rows, self._columns = rows, columns
-        self.nbytes = rows.nbytes
-
-    def __getitem__(self, rows: slice) -> NDArray[np.float32]:
-        block: NDArray[np.float32] = self._rows[rows]
-        return block[:, self._columns]
-
-
 def columns_named(columns: Sequence[Quantity], name: str, environment: str) -> list[int]:
     """Return the numbers of the columns of a name, or of NAME[0], NAME[1] and so on.
 
@@ -323,7 +317,7 @@ class EnvironmentData:
         self.id, self.digest, self.discrete = environment, digest, discrete
         self.logs = self._logs = logs
         self._recordings = dict(recordings or {})
-        self._file, self._stored = file, parts
+        self._file, self._parts = file, parts
         self.anomalies = tuple(map(str, conditions_in(parts)))
         self.sensors, self.actions = (
             tuple(map(Quantity.read, map(json.loads, names[:])))
@@ -333,8 +327,7 @@ class EnvironmentData:
             pairs = zip(self.sensors, roles, strict=True)
             self.sensors = tuple(replace(sensor, role=role) for sensor, role in pairs)
         self.columns = self.sensors
-        sensors = [i for i, column in enumerate(self.columns) if column.role != "score"]
-        self._show(sensors if len(sensors) < len(self.columns) else None)
+        self._show([i for i, column in enumerate(self.columns) if column.role != "score"])
 
     def of_columns(self, names: Sequence[str]) -> "EnvironmentData":
         """Return the same episodes with some of their columns in place of the sensors.
@@ -359,23 +352,17 @@ class EnvironmentData:
         view._show(numbers)  # noqa: SLF001  of this class
         return view
 
-    def _show(self, columns: list[int] | None) -> None:
-        """Let episodes have some of the stored columns as their sensors; None for all."""
-        self._parts = self._stored
-        if columns is not None:
-            self.sensors = tuple(self.columns[i] for i in columns)
-            self._parts = {
-                name: {**part, "observations": _Columns(part["observations"], columns)}
-                for name, part in self._stored.items()
-                if name != NAMES
-            }
-            if self._logs and self._logs.offsets:
-                offsets = tuple(self._logs.offsets[i] for i in columns)
-                self.logs = replace(self._logs, offsets=offsets)
-        nominal = (TrajectorySet(self._parts, part) for part in NOMINAL)
-        self.train, self.calibration, self.twins = nominal
-        failed = FAILURES in self._parts
-        self.failures = TrajectorySet(self._parts, FAILURES) if failed else None
+    def _show(self, columns: list[int]) -> None:
+        """Let episodes have some of the stored columns as their sensors."""
+        self.sensors = tuple(self.columns[i] for i in columns)
+        if self._logs and self._logs.offsets:
+            offsets = tuple(self._logs.offsets[i] for i in columns)
+            self.logs = replace(self._logs, offsets=offsets)
+        self._columns = slice(None) if columns == [*range(len(self.columns))] else columns
+        groups = [group for group in (*NOMINAL, FAILURES) if group in self._parts]
+        sets = {group: TrajectorySet(self._parts, group, self._columns) for group in groups}
+        self.train, self.calibration, self.twins = (sets[part] for part in NOMINAL)
+        self.failures = sets.get(FAILURES)
 
     @property
     def baseline(self) -> int:
@@ -444,7 +431,7 @@ class EnvironmentData:
             When this split has no such anomaly.
         """
         check_known(f"anomaly of {self.id}", self.anomalies, str(anomaly))
-        return LabelledSet(self._parts, f"test/{anomaly}")
+        return LabelledSet(self._parts, f"test/{anomaly}", self._columns)
 
     def anomalous(self, anomaly: str | Condition) -> AnomalousSet:
         """Return the test trajectories with one anomaly, in the order of their twins.
@@ -465,7 +452,7 @@ class EnvironmentData:
             When this split has no such anomaly.
         """
         check_known(f"anomaly of {self.id}", self.anomalies, str(anomaly))
-        return AnomalousSet(self._parts, f"test/{anomaly}")
+        return AnomalousSet(self._parts, f"test/{anomaly}", self._columns)
 
     def arrays(self, part: str) -> dict[str, NDArray[Any]]:
         """Return the datasets of a part as they are stored.
@@ -480,7 +467,7 @@ class EnvironmentData:
         dict
             Arrays by the names of the datasets.
         """
-        return {name: dataset[:] for name, dataset in self._stored[part].items()}
+        return {name: dataset[:] for name, dataset in self._parts[part].items()}
 
     def close(self) -> None:
         """Close the file."""

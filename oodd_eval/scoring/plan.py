@@ -201,10 +201,8 @@ def _lacking(spec: DetectorSpec, split: Split, environment: str) -> str:
     """Return what a detector needs that an environment has not; empty if nothing."""
     entry = split.manifest["environments"][environment]
     if spec.training == "failures" and FAILURES not in entry["groups"]:
-        return (
-            f"{environment} has no failed episodes to learn from: import logs with an outcome and "
-            "with failures = 0.5, the share of the failed episodes for training"
-        )
+        advice = "import logs with an outcome and the share of failed ones, as in failures = 0.5"
+        return f"{environment} has no failed episodes to learn from: {advice}"
     columns, facts = [*map(Quantity.read, entry["sensors"])], layout.log_facts(entry)
     try:
         numbers = [i for name in spec.columns for i in columns_named(columns, name, environment)]
@@ -212,10 +210,8 @@ def _lacking(spec: DetectorSpec, split: Split, environment: str) -> str:
         return str(error)
     shifted = [columns[i].name for i in numbers if facts and facts.offsets and facts.offsets[i]]
     if shifted and spec.alarm in RECORDED:
-        return (
-            f"{shifted[0]} of {environment} is stored less its mean, as float32 cannot tell its "
-            "spread: import the logs with this column among scores, which are stored as they are"
-        )
+        advice = "import the logs with it among scores, which are stored as they are"
+        return f"{shifted[0]} of {environment} is stored less its mean: {advice}"
     return ""
 
 

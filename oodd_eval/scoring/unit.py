@@ -162,9 +162,8 @@ class GroupedScoring:
             self._baseline = Baseline.fit(islice(data.train, job.plan.limit), rows)
             self._lengths = {p: [n - rows for n in ns] for p, ns in self._lengths.items()}
         self._train = _Visible(data.train, job.plan.limit, self._visible)
-        self._failures = None
-        if job.unit.training == "failures" and data.failures is not None:
-            self._failures = _Visible(data.failures, job.plan.limit, self._visible)
+        failed = data.failures if job.unit.training == "failures" else None
+        self._failures = failed and _Visible(failed, job.plan.limit, self._visible)
         sizes = {part: len(lengths) for part, lengths in self._lengths.items()}
         self._groups = mixed(sizes) if job.streamed else groups(sizes)
         # Metrics with twins alone are of explanations, and there are no baseline rows then. The
@@ -253,8 +252,7 @@ class GroupedScoring:
             baseline=self._adapting,
             roles=unit.roles,
         )
-        failures = None if self._failures is None else [*self._failures]
-        contract.fit_detector(detector, [*self._train], self._progress, failures)
+        contract.fit_detector(detector, [*self._train], self._progress, self._failures)
         self._progress(1.0)
         return detector
 

@@ -92,8 +92,8 @@ def test_a_name_says_the_column_and_how_it_counts(name, canonical, column, alarm
         ("column:a:b", r'scores = \["new = old"\]'),
         ("column:größe", "names no column"),
         ("column:" + "x" * 121, "names no column"),
-        ("flag:-x", "a flag has no sign, expected flag:x"),
-        ("flag:|x|", "a flag has no sign, expected flag:x"),
+        ("flag:-x", "expected flag:NAME of letters"),
+        ("flag:abs(x)", "expected flag:NAME of letters"),
     ],
 )
 def test_a_text_that_is_no_name_of_a_column_is_refused(name, message):

@@ -125,11 +125,13 @@ class Trial:
             self.learn(detector, tuple(self.training()) if nominal is None else nominal)
         return detector
 
-    def learn(self, detector: Any, nominal: Sequence[Trajectory], **further: Any) -> None:
-        """Fit a detector, with failed episodes if it declares that it learns from them."""
+    def learn(
+        self, detector: Any, nominal: Sequence[Trajectory], first: int = 7000, **further: Any
+    ) -> None:
+        """Fit a detector, with episodes that get ten times noisier if it declares failures."""
         if self.spec.training == "failures":
-            failed = self.failed(nominal[0].observation_dim)
-            further = {"failures": tuple(failed), **further}
+            episodes = self.training(nominal[0].observation_dim, first)
+            further["failures"] = tuple(noisy_from(x, self.rows // 2) for x in episodes)
         detector.fit(nominal, **further)
 
     @functools.cached_property
@@ -192,11 +194,6 @@ class Trial:
     def training(self, sensors: int = 0, first: int = 1000) -> list[Trajectory]:
         """Return nominal episodes of equal length to fit on."""
         return [self.episode(first + i, sensors=sensors) for i in range(EPISODES)]
-
-    def failed(self, sensors: int = 0, first: int = 7000) -> list[Trajectory]:
-        """Return failed episodes to fit on: their sensors get ten times noisier."""
-        episodes = self.training(sensors, first)
-        return [noisy_from(x, self.rows // 2 + i) for i, x in enumerate(episodes)]
 
     def nominal(self, n: int = 4) -> list[Trajectory]:
         """Return nominal episodes to score, of unequal lengths, not among the training ones."""

@@ -8,12 +8,8 @@ from oodd_eval import Detector, DetectorSpec, hookimpl
 from oodd_eval.errors import UsageError
 from oodd_eval.names import COLUMN_NAME
 
-_SUMMARIES = {
-    "column": "{} as it was recorded is the score",
-    "mean": "mean of {} since the episode began",
-    "flag": "an alarm of its own: where {} is not 0",
-}
-_NAMED = re.compile(r"(-?)(?:\|(?P<a>.+)\||abs\((?P<b>.+)\)|(?P<c>.*))")
+_KINDS = {"column": "{} as recorded", "mean": "mean of {} so far", "flag": "where {} is not 0"}
+_NAMED = re.compile(r"(-?)(?:\|(N)\||abs\((N)\)|(N))".replace("N", COLUMN_NAME), re.ASCII)
 
 
 @hookimpl
@@ -26,25 +22,21 @@ def oodd_detector_from_spec(spec: str) -> DetectorSpec | None:
         When the text behind the colon is no name of a column, perhaps with a sign.
     """
     kind, _, text = spec.partition(":")
-    if kind not in _SUMMARIES:
+    if kind not in _KINDS:
         return None
     match = _NAMED.fullmatch(text)
-    name = match and (match["a"] or match["b"] or match["c"])
-    signs = "NAME" if kind == "flag" else "NAME, -NAME or abs(NAME)"
-    if not match or not name or not re.fullmatch(COLUMN_NAME, name, re.ASCII):
+    if not match or (kind == "flag" and text != match[4]):
+        signs = "NAME" if kind == "flag" else "NAME, -NAME or abs(NAME)"
         raise UsageError(
-            f"{spec!r:.200} names no column: expected {kind}:{signs}, with a NAME of letters, "
-            "digits, blanks and any of -_+./%()[]; import the logs with scores or sensors of such "
-            'names, as in scores = ["new = old"]'
+            f"{spec!r:.200} names no column: expected {kind}:{signs} of letters, digits, blanks "
+            'and any of -_+./%()[]; import the logs with such a name, as in scores = ["new = old"]'
         )
-    size = not match["c"]
-    if kind == "flag" and (match[1] or size):
-        raise UsageError(f"{spec!r}: a flag has no sign, expected {kind}:{name}")
-    argument = match[1] + (f"abs({name})" if size else name)
+    name = match[2] or match[3] or match[4]
+    argument = match[1] + (name if match[4] else f"abs({name})")
     return DetectorSpec(
         name=f"{kind}:{argument}",
-        factory=partial(_make, kind, -1 if match[1] else 1, size),
-        summary=_SUMMARIES[kind].format(argument),
+        factory=partial(_make, kind, -1 if match[1] else 1, not match[4]),
+        summary=_KINDS[kind].format(argument),
         deterministic=True,
         alarm="flag" if kind == "flag" else "column",
         columns=(name,),

@@ -50,9 +50,8 @@ class RecordedColumn:
         """Begin a new live episode."""
         self._sum, self._rows = 0.0, 0
 
-    def update(self, observation: ArrayLike, action: object = None) -> float:
+    def update(self, observation: ArrayLike, action: object = None) -> float:  # noqa: ARG002
         """Return the score of the next observation, which holds the column alone."""
-        del action
         score = float(self._column(Trajectory(np.asarray(observation)[None]).observations)[0])
         self._sum, self._rows = self._sum + score, self._rows + 1
         return self._sum / self._rows if self.kind == "mean" else score
