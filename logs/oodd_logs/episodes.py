@@ -910,9 +910,9 @@ def _settle_columns(source: EpisodeSource, recipe: Recipe) -> None:
     """Drop constant sensors if asked to, and find offsets of those that float32 cannot tell."""
     train = _moments(source, source.parts[TRAIN])
     is_constant = train.low == train.high
-    same = itertools.compress(source.sensors, is_constant)
-    if scores := [q.name for q in same if q.role == "score"]:  # a flag is never raised there
-        source.notes.append(f"scores that are constant in training, and kept: {', '.join(scores)}")
+    same = itertools.compress(source.sensors[source.measured :], is_constant[source.measured :])
+    if names := ", ".join(q.name for q in same):  # a flag is never raised there
+        source.notes.append(f"scores that are constant in training, and kept: {names}")
     is_constant[source.measured :] = False
     names = ", ".join(q.name for q, same in zip(source.sensors, is_constant, strict=True) if same)
     is_dropped = recipe.constant == "drop"
@@ -934,9 +934,8 @@ def _settle_columns(source: EpisodeSource, recipe: Recipe) -> None:
         cells = "".join(entry.where() for entry in source.ledger.of("cell", "kept"))
         raise TrajectoryError(f"sensor {name!r} reaches {largest:g}, too large for float32{cells}")
     blurred = is_coarse(spread, every.largest)
-    coarse = itertools.compress(source.sensors, blurred)
-    if scores := [q.name for q in coarse if q.role == "score"]:  # which are as they were recorded
-        names = ", ".join(scores)
+    coarse = itertools.compress(source.sensors[source.measured :], blurred[source.measured :])
+    if names := ", ".join(q.name for q in coarse):  # which stay as they were recorded
         problem = f"float32 cannot tell values of these scores: {names}"
         source.notes.append(f"warning: {problem}; record them without what never changes")
     blurred[source.measured :] = False

@@ -17,7 +17,14 @@ import numpy as np
 from oodd_eval._version import __version__
 from oodd_eval.data.facts import ENVIRONMENTS, title_of
 from oodd_eval.data.files import Unfailing, remove_abandoned, temporary_directory
-from oodd_eval.data.parts import AnomalousSet, EnvironmentData, LabelledSet, TrajectorySet, parts_of
+from oodd_eval.data.parts import (
+    FAILURES,
+    AnomalousSet,
+    EnvironmentData,
+    LabelledSet,
+    TrajectorySet,
+    parts_of,
+)
 from oodd_eval.data.split import Split
 from oodd_eval.data.trajectory import Trajectory
 from oodd_eval.errors import OutputError
@@ -71,6 +78,7 @@ def export(
         for environment in environments:
             with contextlib.closing(split.environment(environment)) as data:
                 parts = data.train, *parts_of(data, data.anomalies).values()
+                parts += (data.failures,) if data.failures else ()
                 for trajectories in (part for part in parts if len(part)):
                     identity = f"{NAMESPACE}/{name}/{environment}/{_dataset(trajectories.group)}"
                     _write(directory, identity, data, trajectories, split)
@@ -100,6 +108,8 @@ def _write(
                 group = stored.create_group(f"episode_{i}")
                 _episode(group, i, trajectories, trajectory, data.discrete, ended[i])
         content, further = f"nominal, {trajectories.group}", ""
+        if trajectories.group == FAILURES:
+            content = "failed episodes for training"
         anomalies = f"{trajectories.group.removeprefix('test/')} anomalies"
         if isinstance(trajectories, AnomalousSet):
             content = f"{anomalies} from an onset on"
@@ -110,6 +120,8 @@ def _write(
         source = f"trajectories of a fixed policy ({policy}), from"
         source = "episodes of logs, as imported into" if data.logs else source
         further = f", name, task{further}" if data.logs else further
+        scores = [q.name for q in data.columns if q.role == "score"]
+        without = f", without the recorded scores {', '.join(scores)}" if scores else ""
         infinity = float("inf")
         # Commands of the benchmark's robots are shares of a motor's power; others may be anything.
         bound = 1.0 if data.id in ENVIRONMENTS else infinity
@@ -128,7 +140,7 @@ def _write(
             "algorithm_name": policy,
             "author": ["The oodd-eval developers"],
             "description": f"{title_of(data.id)}, {content}: {source} split {split.name} of "
-            f"oodd-eval. Episode metadata: seed{further}.",
+            f"oodd-eval{without}. Episode metadata: seed{further}.",
             "oodd_eval_version": __version__,
             "split_digest": split.digest,
             "sensors": [dataclasses.asdict(quantity) for quantity in data.sensors],

@@ -163,7 +163,6 @@ def respellings(layout: Layout, recipe: Recipe, first: Layout | None) -> dict[tu
     pairs = [(topic, name, spelled(topic, name)) for topic, name in expected - there]
     names = {(topic, old): name for topic, name, old in pairs if old}
     texts = (*_texts_of(recipe), *recipe.sensors, *recipe.actions, recipe.reward, *recipe.time)
-    texts += recipe.scores
     plain = [t.rpartition("=")[2].strip() for t in texts if t and not {*t} & {*"*?"}]
     exact = {text: _matches(layout, text)[0] for text in plain}
     taken = {column for columns in exact.values() for column in columns}
@@ -287,7 +286,7 @@ def _texts_of(recipe: Recipe) -> list[str]:
     """Return what names columns, or fields, that say something of a recording or its rows."""
     tables = [recipe.nominal.where, *(table.where for table in recipe.anomalous.values())]
     keys = recipe.outcome, recipe.kinds, recipe.task, *(key for t in tables for key in t)
-    return [*recipe.label_columns, *filter(None, keys)]
+    return [*recipe.label_columns, *recipe.scores, *filter(None, keys)]
 
 
 def with_sensors(recipe: Recipe, recording: Recording) -> Recipe:
@@ -297,7 +296,6 @@ def with_sensors(recipe: Recipe, recording: Recording) -> Recipe:
     if recipe.sensors or "obs" in {match[1].lower() for match in matches if match}:
         return recipe
     texts = [*recipe.actions, *_texts_of(recipe), *recipe.time, *filter(None, [recipe.reward])]
-    texts += recipe.scores
     named = {(c.topic, c.column) for text in texts for c in find_columns(layout, text)}
     unnamed = (pair for pair in _pairs(layout) if pair not in named)
     sensors = tuple(f"{topic}.{name}" if topic else name for topic, name in unnamed)

@@ -75,18 +75,17 @@ def cells(topic, *names):
     return {name: column.tolist() for name, column in columns.items()}
 
 
-def test_messages_are_topics_by_instance_in_the_units_that_the_file_names(tmp_path):
+def test_messages_are_topics_by_instance(tmp_path):
     path = tmp_path / "flight.BIN"
     path.write_bytes(flight(4))
     log = opened(path)
     assert [*log.topics] == ["XKF4", "XKF4_1", "GPS", "MODE"]
     gps = log.topics["GPS"]
-    # A voltage in thousandths has no unit here, as its numbers are not in volts.
-    assert (gps.names, gps.time) == (("time", "Lat[deg]", "Alt[m]", "Spd[m/s]", "Volt"), "time")
-    assert cells(gps, "time", "Lat[deg]", "Volt") == {
-        "time": [9e-6, 0.200009], "Lat[deg]": [47.5000001, 47.5000003], "Volt": [1200, 1202],
+    assert (gps.names, gps.time) == (("time", "Lat", "Alt", "Spd", "Volt"), "time")
+    assert cells(gps, "time", "Lat", "Volt") == {
+        "time": [9e-6, 0.200009], "Lat": [47.5000001, 47.5000003], "Volt": [1200, 1202],
     }  # fmt: skip
-    assert gps.read(["Alt[m]"], 1, 2)["Alt[m]"] == pytest.approx([123.45], abs=1)
+    assert gps.read(["Alt"], 1, 2)["Alt"] == pytest.approx([123.45], abs=1)
     first, second = log.topics["XKF4"], log.topics["XKF4_1"]
     draws = np.random.default_rng(0).integers(0, 90, 6) / 100
     assert first.read(["SV", "SP", "OFN"], 0, 1) == dict(
@@ -106,7 +105,7 @@ def test_test_ratios_of_its_filter_are_proposed_as_scores(tmp_path):
     recipe = draft_recipe(tmp_path)
     assert (recipe.format, recipe.rate) == ("ardupilot", 5)
     assert recipe.scores == ("XKF4.SV", "XKF4.SP", "XKF4_1.SV", "XKF4_1.SP")
-    assert "GPS.Spd[m/s]" in recipe.sensors
+    assert "GPS.Spd" in recipe.sensors
     # Anything may end in .bin.
     (tmp_path / "log.csv").write_text("a,b\n1,2\n3,4\n")
     assert recognised(tmp_path, "")[0].name == "csv"

@@ -1,14 +1,18 @@
 """Recipes that keep what a monitor computed, failed episodes for training, and unseen tasks."""
 
+import json
+
 import numpy as np
 import pytest
 from oodd_logs.importing import import_frames, import_recipe
 from oodd_logs.inspection.draft import draft_recipe
 from oodd_logs.inspection.logs import inspect_logs
 from oodd_logs.inspection.report import as_json, describe_logs
+from oodd_logs.minari_files import export
 from oodd_logs.recipe import Recipe
 from oodd_logs.scanning.logs import read_logs
 
+from oodd_eval import load_split
 from oodd_eval.errors import TrajectoryError, UsageError
 
 ROWS = 50
@@ -190,6 +194,24 @@ def test_unseen_tasks_are_in_the_test_alone(tmp_path):
     for name, episodes in seen.items():
         others = [episode for episode in found[name] if episode[0] != "1"]
         assert others == [episode for episode in episodes if episode[0] != "1"]
+
+
+def test_an_export_has_the_failures_and_says_which_scores_it_lacks(tmp_path):
+    rollouts(tmp_path)
+    parts(tmp_path, failures=0.5)
+    with load_split(tmp_path / "split").opened() as opened:
+        lengths = opened("s").failures.lengths
+    split = load_split(tmp_path / "split")
+    written = export(split, tmp_path / "sets", environments=["s"], progress=len)
+    assert [name.rpartition("/")[2] for name in written] == [
+        "train-v0", "calibration-v0", "test-nominal-v0", "test-failure-v0", "failures-v0",
+    ]  # fmt: skip
+    file = tmp_path / "sets" / written[-1] / "data" / "metadata.json"
+    content = json.loads(file.read_text())
+    assert content["total_steps"] == lengths.sum()
+    assert "failed episodes for training" in content["description"]
+    assert "without the recorded scores chunk_mse" in content["description"]
+    assert [sensor["name"] for sensor in content["sensors"]] == ["number"]
 
 
 @pytest.mark.parametrize(
