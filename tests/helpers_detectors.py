@@ -21,6 +21,8 @@ SMALL = {
     "logpzo": FEW_UNITS,
     "logpzo-a": FEW_UNITS,
     "wm-kl-a": FEW_UNITS,
+    "lstm": FEW_UNITS,
+    "dagmm": {"updates": 120, "batch": 64},
     "paano": {**ENSEMBLE, "window": 8, "batch": 16},
     "sklearn:IsolationForest": {"n_estimators": 10},
 }

@@ -98,7 +98,10 @@ OTHERS = [
     *((name, {}) for name in ("manifold", "panel", "oracle-gym")),
     *((name, {"trees": 3}) for name in ("rf", "rf-ewma")),
     *((name, {"updates": 3}) for name in ("pe", "pe-a", "npn", "riqn", "riqn-ms", "rnd", "paano")),
-    *((name, {"updates": 3}) for name in ("rpt-a", "logpzo", "logpzo-a", "wm-kl-a")),
+    *(
+        (name, {"updates": 3})
+        for name in ("rpt-a", "logpzo", "logpzo-a", "wm-kl-a", "lstm", "dagmm")
+    ),
 ]
 
 

@@ -1,6 +1,7 @@
 """The rivals that train networks: closed forms, torch against NumPy, and what all promise."""
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -8,8 +9,10 @@ import torch
 from helpers_state import assert_zero_scales_are_refused
 from oodd_rivals import oodd_detectors
 from oodd_rivals.flow import FlowNorm, of_transitions
+from oodd_rivals.mixture import WIDTHS, _mixture, encoded, energy
 from oodd_rivals.network_parameters import (
     FlowParameters,
+    LstmParameters,
     RaptParameters,
     TransitionFlowParameters,
     WorldModelParameters,
@@ -17,6 +20,7 @@ from oodd_rivals.network_parameters import (
 from oodd_rivals.network_training import draw, ridge
 from oodd_rivals.networks import gru_step
 from oodd_rivals.rapt import RecurrentForecast, _forecast
+from oodd_rivals.stacked_lstm import SHRINKAGE, StackedLstm, _outputs
 from oodd_rivals.world_model import Belief, WorldModel
 from oodd_torch.gru import GruCell
 from scipy import stats
@@ -24,8 +28,9 @@ from scipy import stats
 from oodd_eval import Trajectory
 from oodd_eval.errors import TrajectoryError
 
-ROWS = ("rpt-a", "logpzo", "logpzo-a", "wm-kl-a")
 SMALL = {"updates": 120, "units": 8, "batch": 16}
+SETTINGS = dict.fromkeys(("rpt-a", "logpzo", "logpzo-a", "wm-kl-a", "lstm"), SMALL)
+SETTINGS["dagmm"] = {"updates": 120, "batch": 64}
 
 
 def episode(seed, n=60):
@@ -58,39 +63,41 @@ NOMINAL = [episode(seed) for seed in range(8)]
 
 @pytest.fixture(scope="module")
 def fitted():
-    return {name: make(name, **SMALL).fit(NOMINAL) for name in ROWS}
+    return {name: make(name, **settings).fit(NOMINAL) for name, settings in SETTINGS.items()}
 
 
 # What all of them promise
 
 
-@pytest.mark.parametrize("name", ROWS)
+@pytest.mark.parametrize("name", SETTINGS)
 def test_zero_scales_in_a_state_are_refused(fitted, name):
-    scales = {"rpt-a": ["unit", "calibration"], "wm-kl-a": ["unit"]}.get(name, [])
-    assert_zero_scales_are_refused(fitted[name], make(name, **SMALL), ["std", *scales])
+    scales = {"rpt-a": ["unit", "calibration"], "wm-kl-a": ["unit"]}
+    scales["lstm"] = scales["rpt-a"]
+    unfitted = make(name, **SETTINGS[name])
+    assert_zero_scales_are_refused(fitted[name], unfitted, ["std", *scales.get(name, [])])
 
 
-@pytest.mark.parametrize("name", ROWS)
+@pytest.mark.parametrize("name", SETTINGS)
 def test_the_seed_decides_what_is_learnt(fitted, name):
-    other = make(name, **SMALL, seed=1).fit(NOMINAL).score(NOMINAL[0])
+    other = make(name, **SETTINGS[name], seed=1).fit(NOMINAL).score(NOMINAL[0])
     assert not np.allclose(other[1:], fitted[name].score(NOMINAL[0])[1:])
 
 
-@pytest.mark.parametrize("name", ROWS)
+@pytest.mark.parametrize("name", SETTINGS)
 def test_a_constant_sensor_that_moves_adds_a_bounded_surprise(fitted, name):
     x = episode(105)
     rows = x.observations.copy()
     rows[20:, 2] = 1e6
     more = fitted[name].score(Trajectory(rows, x.actions)) - fitted[name].score(x)
-    terms = 6 if name == "wm-kl-a" else 3  # a divergence is half a square
+    terms = {"wm-kl-a": 6, "dagmm": 2}.get(name, 3)  # half a square, a sensor; an energy's is whole
     np.testing.assert_array_equal(more[1:20], 0.0)
     np.testing.assert_allclose(more[20:], 2 * math.log(len(NOMINAL) + 1) / terms)
 
 
-@pytest.mark.parametrize("name", ROWS)
+@pytest.mark.parametrize("name", SETTINGS)
 def test_episodes_without_a_transition_cannot_be_learned_from(name):
     with pytest.raises(TrajectoryError, match="cannot be fitted"):
-        make(name, **SMALL).fit([Trajectory(np.zeros((1, 2)), np.zeros((0, 1)))])
+        make(name, **SETTINGS[name]).fit([Trajectory(np.zeros((1, 2)), np.zeros((0, 1)))])
 
 
 # What they share
@@ -288,3 +295,139 @@ def test_beyond_one_step_the_prior_is_rolled_out_with_the_actions_commanded(fitt
         z = prior.mean
     expected = one.divergence(beliefs[2], prior) / 3
     assert three.score(x)[3] == pytest.approx(expected)
+
+
+# lstm
+
+
+def lstm(**parameters):
+    settings = {"units": 16, "batch": 16, "updates": 300, **parameters}
+    horizon = settings.pop("horizon", 1)
+    return StackedLstm("lstm", LstmParameters(**settings), seed=0, horizon=horizon)
+
+
+def beats(seed, n=120, every=7):
+    """A pulse every seven rows, from a row of its own on, with little noise."""
+    rng = np.random.default_rng(seed)
+    pulse = (np.arange(n) % every == rng.integers(every)).astype(float)
+    return Trajectory((pulse + 0.05 * rng.normal(size=n))[:, None], np.zeros((n - 1, 0)))
+
+
+def test_the_stacked_network_of_torch_is_that_of_numpy(fitted):
+    detector = fitted["lstm"]
+    rows = detector._standard(episode(112))
+    weights = {n: torch.from_numpy(w).float()[None] for n, w in detector.weights_.items()}
+    starts = torch.zeros(len(rows), 1, dtype=torch.bool)
+    starts[30] = True  # what the first 30 rows left behind is forgotten
+    x = torch.from_numpy(rows).float()[:, None]
+    outputs, _ = _outputs(weights, x, torch.zeros(2, 2, 1, SMALL["units"]), starts)
+    w, expected = detector.weights_, []
+    for part in (rows[:30], rows[30:]):
+        carried = detector._beginning()
+        for row in part:
+            _, carried = detector._next(row[None], row[None], carried)
+            linear = row[None] @ w["base"][:-1] + w["base"][-1]
+            changes = (carried[1][0] - row).reshape(1, -1)
+            expected.append((changes - linear) / w["unit"])
+    np.testing.assert_allclose(outputs[:, 0], np.concatenate(expected), atol=1e-4)
+
+
+@pytest.mark.parametrize("horizon", [1, 2])
+def test_errors_are_of_the_forecasts_that_were_made_of_the_same_row(horizon):
+    detector = lstm(updates=5, steps=3, horizon=horizon).fit(NOMINAL)
+    rows = detector._standard(episode(113))[:9]
+    carried, forecasts = detector._beginning(), []
+    for row in rows:
+        _, carried = detector._next(row[None], row[None], carried)
+        forecasts.append(carried[1][0])
+    errors = detector._errors(rows).reshape(-1, 3, 2)
+    assert len(errors) == 9 - horizon
+    for t in range(horizon, 9):
+        for j in range(3):
+            made = t - horizon - j  # when o_t was step j of the forecast
+            expected = rows[t] - forecasts[made][j] if made >= 0 else [np.nan] * 2
+            np.testing.assert_array_equal(errors[t - horizon, j], expected)
+
+
+def test_the_stacked_network_remembers_what_a_row_does_not_show():
+    detector = lstm(updates=300).fit([beats(seed) for seed in range(20)])
+    assert detector.loss_ < 0.1  # of what a linear forecast of the newest row leaves
+    x = beats(99)
+    rows = x.observations.copy()
+    late = int(np.flatnonzero(rows[60:, 0] > 0.5)[0]) + 60
+    rows[[late, late + 1]] = rows[[late + 1, late]]
+    scores = detector.score(Trajectory(rows, x.actions))
+    assert scores[late] > 20 * np.median(scores[40:])
+
+
+def test_the_score_is_the_mahalanobis_distance_of_errors_of_held_out_episodes(fitted):
+    detector = fitted["lstm"]
+    held_out = NOMINAL[np.random.default_rng([0, 0]).permutation(8)[0]]
+    errors = detector._errors(detector._standard(held_out))
+    whole = errors[2:]  # before, forecasts two and three steps ahead are from nowhere
+    spread = whole.std(axis=0)
+    correlation = np.corrcoef(whole.T)
+    shrunk = (1 - SHRINKAGE) * correlation + SHRINKAGE * np.eye(6)
+    centred = (whole - whole.mean(axis=0)) / spread
+    lengths = np.einsum("ni,ij,nj->n", centred, np.linalg.inv(shrunk), centred)
+    np.testing.assert_allclose(detector.score(held_out)[3:], lengths / 9, rtol=1e-6)
+    first = np.r_[(errors[0, :2] - whole.mean(axis=0)[:2]) / spread[:2], np.zeros(4)]
+    expected = first @ np.linalg.solve(shrunk, first) / 9
+    assert detector.score(held_out)[1] == pytest.approx(expected)
+
+
+def test_episodes_without_a_whole_forecast_are_left_out():
+    short = Trajectory(np.full((3, 3), 99.0), np.zeros((2, 0)))
+    alone, beside = (lstm(updates=3).fit(x) for x in (NOMINAL, [*NOMINAL, short]))
+    np.testing.assert_array_equal(alone.score(NOMINAL[0]), beside.score(NOMINAL[0]))
+    with pytest.raises(TrajectoryError, match="0 have at least 5 transitions"):
+        lstm(steps=5).fit([short])
+
+
+# dagmm
+
+
+def test_a_mixture_of_two_groups_is_their_means_and_covariances():
+    rng = np.random.default_rng(0)
+    groups = rng.normal(size=(30, 2)) @ [[2, 1], [0, 1]], rng.normal(size=(90, 2)) - 9
+    z = torch.from_numpy(np.concatenate(groups))
+    members = torch.from_numpy(np.repeat(np.eye(2), [30, 90], axis=0))
+    shares, centres, roots, inverse = _mixture(z, members)
+    laws = [stats.multivariate_normal(g.mean(0), np.cov(g.T, bias=True)) for g in groups]
+    density = 0.25 * laws[0].pdf(z) + 0.75 * laws[1].pdf(z)
+    found = energy(z.numpy(), shares.numpy(), centres.numpy(), roots.numpy(), np, np.matmul)
+    np.testing.assert_allclose(found, -np.log(density), rtol=1e-4)
+    assert float(inverse) == pytest.approx(sum((1 / g.var(axis=0)).sum() for g in groups), rel=1e-4)
+
+
+def test_features_of_a_reconstruction_by_hand():
+    # The code is the first column, and what is decoded is (code, 0).
+    shapes = {"encode": (2, *WIDTHS, 1), "decode": (1, *WIDTHS[::-1], 2)}
+    w = {}
+    for name, sizes in shapes.items():
+        for n, shape in enumerate(pairwise(sizes)):
+            w[f"{name}_{n}"], w[f"{name}_{n}_bias"] = np.zeros(shape), np.zeros(shape[1])
+            w[f"{name}_{n}"][0, 0] = 1.0
+    z, again = encoded(np.array([[3.0, 4.0]]), w, np, np.matmul)
+    code = np.tanh(np.tanh(np.tanh(3.0)))
+    decoded = np.tanh(np.tanh(np.tanh(code)))
+    np.testing.assert_allclose(again, [[decoded, 0.0]])
+    far = np.hypot(3 - decoded, 4) / 5
+    np.testing.assert_allclose(z, [[code, far, 0.6]])
+
+
+def test_the_energy_of_a_window_is_that_of_torch(fitted):
+    detector = make("dagmm", updates=60, batch=64, window=3, code=2, components=2).fit(NOMINAL)
+    x = episode(114)
+    rows = (x.observations[:, :2] - detector.scale_.mean[:2]) / detector.scale_.std[:2]
+    latest = np.hstack([rows[np.maximum(np.arange(60) - k, 0)] for k in range(3)])
+    w = {n: torch.from_numpy(v) for n, v in detector.weights_.items()}
+    z, _ = encoded(torch.from_numpy(latest), w, torch, torch.matmul)
+    roots = w["roots"].reshape(2, 4, 4)
+    expected = energy(z, w["shares"][0], w["centres"], roots, torch, torch.matmul)
+    np.testing.assert_allclose(detector.score(x), expected, rtol=1e-5, atol=1e-5)
+
+
+def test_training_lowers_the_whole_loss():
+    losses = [make("dagmm", updates=n, batch=64).fit(NOMINAL).loss_ for n in (1, 200)]
+    assert losses[1] < losses[0] - 0.3

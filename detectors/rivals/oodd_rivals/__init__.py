@@ -11,6 +11,8 @@ from oodd_eval import Detector, DetectorSpec, hookimpl
 from oodd_eval.plugins.parameters import checked
 from oodd_rivals.network_parameters import (
     FlowParameters,
+    LstmParameters,
+    MixtureParameters,
     RaptParameters,
     TransitionFlowParameters,
     WorldModelParameters,
@@ -164,5 +166,22 @@ def _networks() -> list[DetectorSpec]:
             inputs="observations+actions",
             horizon_decides_fit=False,
             **torch | {"seconds": 90},
+        ),
+        _spec(
+            name="lstm",
+            detector="stacked_lstm:StackedLstm",
+            parameters=LstmParameters,
+            summary="errors of a stacked LSTM's forecasts, as a multivariate normal law",
+            reference="Malhotra, Vig, Shroff & Agarwal (2015), LSTM-AD",
+            **torch,
+        ),
+        _spec(
+            name="dagmm",
+            detector="mixture:DeepMixture",
+            parameters=MixtureParameters,
+            summary="energy of a window's code and reconstruction in a mixture of normal laws",
+            reference="Zong et al. (2018), DAGMM",
+            horizon_decides_fit=False,
+            **torch,
         ),
     ]

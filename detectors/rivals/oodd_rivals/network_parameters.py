@@ -18,6 +18,28 @@ class RaptParameters:
     )
 
 
+@dataclass(frozen=True, slots=True)
+class LstmParameters:
+    """Parameters of `lstm`."""
+
+    updates: int = parameter(2000, low=1, help="gradient steps")
+    batch: int = parameter(32, low=1, help="pieces of episodes in a batch")
+    chunk: int = parameter(20, low=1, help="steps of a piece, through which gradients flow")
+    units: int = parameter(64, low=1, help="units of each of the two layers")
+    steps: int = parameter(3, low=1, help="rows that are forecast at once, l")
+
+
+@dataclass(frozen=True, slots=True)
+class MixtureParameters:
+    """Parameters of `dagmm`."""
+
+    updates: int = parameter(2000, low=1, help="gradient steps")
+    batch: int = parameter(1024, low=2, help="windows of an update")
+    window: int = parameter(5, low=1, help="latest observations that a judgement looks at, W")
+    code: int = parameter(4, low=1, help="numbers that the encoder makes of a window")
+    components: int = parameter(4, low=1, help="normal laws in the mixture")
+
+
 @dataclass(frozen=True)
 class FlowParameters:
     """Parameters of `logpzo`."""

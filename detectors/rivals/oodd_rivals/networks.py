@@ -83,6 +83,8 @@ class NetworkRival(StorableWindowDetector):
     ) -> None:
         super().__init__(name, seed=seed, horizon=horizon, window=window, lag=lag, actions=actions)
         self.observation_scale_: FeatureScale
+        self.reach = horizon
+        """Transitions that an episode must have to be learned from."""
 
     @abstractmethod
     def _train(self, training: Sequence[Floats], held_out: Sequence[Floats]) -> None:
@@ -97,11 +99,11 @@ class NetworkRival(StorableWindowDetector):
 
     def _learn(self, nominal: Sequence[Trajectory]) -> FeatureScale:
         shapes = {self._widths(x) for x in nominal}
-        usable = [x for x in nominal if x.transitions >= self.horizon]
+        usable = [x for x in nominal if x.transitions >= self.reach]
         if not usable or len(shapes) != 1:
             raise TrajectoryError(
                 f"detector {self.name!r} cannot be fitted on {len(nominal)} trajectories, of "
-                f"which {len(usable)} have at least {self.horizon} transitions, of (sensors, "
+                f"which {len(usable)} have at least {self.reach} transitions, of (sensors, "
                 f"action columns) {sorted(shapes)}: expected at least one that long, all of the "
                 "same shape"
             )
