@@ -82,10 +82,12 @@ def sentences(calibration: ScoreCalibration, name: str) -> Iterator[str]:
             break
     largest, share = calibration.sweep
     margin = " A margin on top lets fewer trip: how many fewer, healthy logs do not tell."
+    # Where several logs have the largest value, further ones may have it, too.
+    most = "at most " * (basis.largest.count(largest) > 1)
     yield (
         f"A hand sweep until none of these {counted(n, 'log(s)')} trips stops at "
-        f"{_rounded_up(largest)}, and lets {100 * share:.3g} % (1/{n + 1}) of further healthy logs "
-        f"trip on average.{margin * (largest > 0)}"
+        f"{_rounded_up(largest)}, and lets {most}{100 * share:.3g} % (1/{n + 1}) of further "
+        f"healthy logs trip on average.{margin * (largest > 0)}"
     )
     test = calibration.drift
     steady = f"No drift seen (rank correlation {test.statistic:.2f}, p = {test.p:.2g})."

@@ -1,5 +1,6 @@
 """Watchdogs of scores that a monitor computes, of recorded columns, and of supervised detectors."""
 
+import functools
 import json
 
 import numpy as np
@@ -7,6 +8,8 @@ import pytest
 from helpers_columns import Sizes, scored_parts, sensors_alone, write_columns_split
 from helpers_live import walk
 from helpers_plugins import install
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from oodd_live import TerminalMonitor, Watchdog
 from oodd_live.reading import STALE
 from oodd_monitors import calibrate
@@ -69,6 +72,41 @@ def test_row_by_row_is_the_calibration_bit_for_bit(alarm, hold, tmp_path):
             assert first == calibration.first(scores)
             alarms.add(first is None)
     assert alarms == {True, False}
+
+
+@functools.cache
+def watched(alarm, hold):
+    calibration = calibrate(HEALTHY, 0.1, alarm=alarm, hold=hold)
+    return calibration, Watchdog.of_scores(calibration)
+
+
+GAPS = st.lists(st.floats(-3, 9, width=16) | st.just(np.nan), min_size=1, max_size=30)
+
+
+@settings(max_examples=150)
+@given(
+    st.sampled_from(["threshold", "cusum", "ewma"]),
+    st.integers(1, 4),
+    GAPS,
+    st.integers(0, 5),
+    st.sampled_from([None, np.nan, np.ma.masked]),
+)
+def test_the_first_alarm_is_that_of_the_whole_episode_or_of_a_gap(alarm, hold, scores, n, nothing):
+    calibration, watchdog = watched(alarm, hold)
+    scores = np.array([*[np.nan] * n, *scores], np.float64)
+    readings = fed(watchdog, [nothing if np.isnan(s) else s for s in scores])
+    statistic = calibration.statistic(scores)
+    scored = ~np.isnan(scores)
+    assert [r.statistic for r, has in zip(readings, scored, strict=True) if has] == [
+        *statistic[scored]
+    ]
+    gap, by_gap = 0, None
+    for t, has in enumerate(scored):
+        gap = 0 if has else gap + 1
+        by_gap = t if by_gap is None and gap > calibration.longest_gap else by_gap
+    rows = [t for t in (calibration.first(scores), by_gap) if t is not None]
+    expected = min(rows, default=None)
+    assert next((r.t for r in readings if r.alarm), None) == expected
 
 
 def test_arrays_are_calibrated_as_calibrate_does_it():

@@ -7,6 +7,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 from oodd_monitors import Detections, LabelledScores, calibrate
+from oodd_monitors.describing import sentences
 
 from oodd_eval.errors import TrajectoryError, UnknownNameError, UsageError
 
@@ -43,6 +44,14 @@ def test_a_hand_sweep_lets_one_in_n_plus_1_by_in_all_orders_of_distinct_values(n
         trips += further > largest
         assert share == 1 / (n + 1)
     assert Fraction(trips, math.factorial(n + 1)) == Fraction(1, n + 1)
+
+
+def test_a_hand_sweep_of_equal_values_lets_at_most_that_share_by():
+    """Of 0, 1 and 1 in any order the last is never above both others, not in one of three."""
+    assert not any(last > max(logs) for *logs, last in itertools.permutations([0, 1, 1]))
+    for peaks, said in (([*range(1, 20)], "lets 5 %"), ([*range(1, 19), 18], "lets at most 5 %")):
+        (text,) = (t for t in sentences(calibrate(logs_of(peaks)), "residual") if "sweep" in t)
+        assert f"and {said} (1/20) of further healthy logs trip on average" in text
 
 
 def test_the_interval_is_that_of_the_share_above_an_order_statistic():
