@@ -210,6 +210,36 @@ def test_baseline_rows_count_for_nothing_and_bring_a_column_nowhere(tmp_path, pa
             assert scores[10:].tobytes() == expected.tobytes()
 
 
+@pytest.mark.parametrize("baseline", [0, 10])
+@pytest.mark.parametrize("how", ["rows", "this process"])
+def test_scores_are_the_same_bits_row_by_row_and_in_this_process(tmp_path, parts, baseline, how):
+    facts = replace(UNPAIRED, baseline=baseline, offsets=(0.0, 5e6, *[0.0] * 6))
+    split = load_split(write_columns_split(tmp_path / "s", parts, facts))
+    changes = {
+        "column:-vel_innov": lambda e: -rows_of(e, "vel_innov")[:, 0].astype(float),
+        "mean:abs(q2)": lambda e: running_mean(abs(rows_of(e, "q2")[:, 0])),
+        "flag:alarm": lambda e: (rows_of(e, "alarm")[:, 0] != 0).astype(float),
+    }
+    results = ResultsDirectory(tmp_path / "out")
+    if how == "rows":
+        settings = RunSettings(jobs=1, limits=Limits(120), streamed=True)
+        plan = _plan(split, *changes, limit=3)
+        records = run(plan, split, discover(), settings, results).records
+    else:
+        specs = [discover().offer(name).spec for name in changes]
+        records = evaluate(specs, split, limit=3, output=tmp_path / "out").records
+    tests = ("calibration", "test/nominal", "test/slip")
+    lengths = {part: [len(e.observations) for e in parts[part][:3]] for part in tests}
+    for record, change in zip(records, changes.values(), strict=True):
+        assert record.ok, record.reason
+        kept = results.scores(record.scores, lengths)
+        for part in lengths:
+            for scores, episode in zip(kept.parts[part], parts[part], strict=False):
+                expected = change(episode)
+                expected[:baseline] = np.nan
+                assert scores.tobytes() == expected.tobytes()
+
+
 def test_other_detectors_score_as_without_scores_and_failures(scored, plain, parts, tmp_path):
     names = ["mahalanobis", "persistence", "clock", "mewma"]
     assert scored.train_digest("arm") != plain.train_digest("arm")
