@@ -1,6 +1,7 @@
 """The scorers for inspect-robots do what their page says, in the released package."""
 
 import ast
+import contextlib
 import json
 import re
 import subprocess
@@ -111,7 +112,8 @@ def trial(page, robot, seed=5, **parts):
         on_trial_end=records.append,
         on_eval_end=lambda log: None,
     )
-    page.eval(page.reach("success_at_end", [seed]), page.policy, robot, sinks=[sink])
+    with contextlib.chdir(page.folder):  # where inspect-robots keeps logs of its own
+        page.eval(page.reach("success_at_end", [seed]), page.policy, robot, sinks=[sink])
     return SimpleNamespace(**{**vars(records[0]), **parts})
 
 
