@@ -61,7 +61,7 @@ class UnknownNameError(UsageError, LookupError):
     """
 
     def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
-        names = sorted(known)
+        names = sorted({*known})
         further = len(names) - _LISTED
         more = f" and {further} more" if further > 0 else ""
         hints = [f"did you mean {close!r}?" for close in near(name, names)[:1]]

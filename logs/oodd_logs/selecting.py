@@ -16,6 +16,7 @@ from typing import Final
 
 from oodd_eval.data.facts import Quantity
 from oodd_eval.errors import TrajectoryError, UnknownNameError, UsageError
+from oodd_eval.names import listed
 from oodd_logs.kinds.naming import pattern_of
 from oodd_logs.readers.cells import nearest_spelling
 from oodd_logs.recipe import Recipe
@@ -270,9 +271,12 @@ def select_columns(layout: Layout, recipe: Recipe, source: str) -> Selection:
     sensors, used = [*sensors, *scores], [*used, *scores]
     for kind, columns in (("sensors", sensors), ("actions", actions)):
         names = [column.quantity.name for column in columns]
-        if double := [name for name in names if names.count(name) > 1]:
-            advice = "rename one, 'new = old'"
-            raise UsageError(f"{source} has two {kind} named {double[0]!r}: {advice}")
+        if name := next((name for name in names if names.count(name) > 1), ""):
+            both = listed(
+                [_aliases(c.topic, c.column)[0] for c in columns if c.quantity.name == name]
+            )
+            problem = f"{source} has two {kind} named {name!r}: name one of {both}, or rename one"
+            raise UsageError(f"{problem}, 'new = old'")
     times = _times(layout, dict.fromkeys(column.topic for column in used), recipe.time, source)
     named = {(c.topic, c.column) for c in (*used, *fields, *chain(*times.values()))}
     unused = tuple(_aliases(*column)[-1] for column in _pairs(layout) if column not in named)

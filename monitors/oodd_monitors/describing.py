@@ -35,7 +35,7 @@ def condition(calibration: ScoreCalibration, name: str, unit: str = "") -> str:
     'residual > 6.33334 m'
     """
     name = name if calibration.alarm == "threshold" else f"{calibration.alarm}({name})"
-    rows = f" in {calibration.hold} rows with a score in a row" if calibration.hold > 1 else ""
+    rows = f" in {calibration.hold} scores in a row" if calibration.hold > 1 else ""
     unit = "" if unit == "1" or calibration.alarm == "cusum" else unit
     return f"{name} > {_rounded_up(calibration.threshold)} {unit}".rstrip() + rows
 
@@ -125,10 +125,8 @@ def by_group(calibration: ScoreCalibration, name: str, unit: str) -> Iterator[st
     for group, row in calibration.groups.items():
         line = condition(row.calibration, name, unit) if row.calibration else row.problem
         shares = _percent(*clopper_pearson(row.above, row.episodes))
-        yield (
-            f"{group}: {line} (pooled, {row.above} of its {row.episodes} healthy logs alarm: "
-            f"{shares})"
-        )
+        pooled = f"pooled, {row.above} of its {row.episodes} healthy logs alarm: {shares}"
+        yield f"{group or 'none'}: {line} ({pooled})"
 
 
 def as_json(calibration: ScoreCalibration) -> dict[str, Any]:

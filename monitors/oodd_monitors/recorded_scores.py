@@ -130,8 +130,12 @@ def read_scores(
     """
     path, column = Path(logs), ScoreColumn.of(score)
     if (path / MANIFEST).is_file() or not path.exists():
-        return _of_split(load_split(logs), column, per)
-    return _of_logs(path, column, recipe, per)
+        scores = _of_split(load_split(logs), column, per)
+    else:
+        scores = _of_logs(path, column, recipe, per)
+    if per and {*scores.groups} <= {""}:
+        raise UsageError(f"no healthy log has a field or column {per!r}, which --per names")
+    return scores
 
 
 def _of_logs(path: Path, column: ScoreColumn, recipe_file: Path | None, per: str) -> RecordedScores:
@@ -156,12 +160,14 @@ def _recipe_and_files(path: Path, recipe_file: Path | None) -> tuple[Recipe, Pat
     """Return how logs are read, the folder that files are relative to, and the files."""
     if recipe_file or path.suffix == ".toml":
         recipe = Recipe.load(recipe_file or path)
-        for root in (path if path.is_dir() else path.parent, (recipe_file or path).parent):
+        for root in (path, path.parent, (recipe_file or path).parent):
             files = {*files_of(recipe, root)} - {root / str(recipe.intervals)}
+            if recipe_file:
+                files = {f for f in files if any(map(path.samefile, (f, *f.parents)))}
             if files:
                 return recipe, root, sorted(files, key=lambda file: in_order(file.as_posix()))
-        expected = f"a file that matches {listed(recipe.globs)}: calibrate FOLDER --recipe FILE"
-        raise UsageError(f"{str(root)!r} holds no log of the recipe, expected {expected}")
+        expected = f"{listed(recipe.globs)}: calibrate FOLDER --recipe FILE"
+        raise UsageError(f"{str(path)!r} holds no file that the recipe lists, expected {expected}")
     logs = inspect_logs(path)
     recipe = replace(Recipe.parse(tomllib.loads(draft(logs))), window=0, rate=None)
     recordings = recognised(path, recipe.format)[1]
@@ -185,8 +191,6 @@ def _of_episodes(source: EpisodeSource, column: ScoreColumn, base: int, per: str
             result.scores.append(scores)
             result.recordings.append(i if episode.recording is None else episode.recording)
             result.groups += [episode.task] if per else []
-    if per and {*result.groups} <= {""}:
-        raise UsageError(f"no healthy log has a field or column {per!r}, which --per names")
     result.notes += _notes(source, result, silent)
     return result
 

@@ -411,8 +411,8 @@ def test_files_that_a_recipe_does_not_list_are_read(tmp_path):
         {"split": "x", "time": "t", "sensors": SENSORS, "nominal": {"files": ["data/good/*.csv"]},
          "anomalous": {"leak": {"files": ["data/bad/*.csv"], "onset": 3}}, "task": "task"}
     )  # fmt: skip
-    # Files of a recipe are relative to its folder, or to the logs.
-    for place, home in (("data", ""), ("", "recipes")):
+    # Files of a recipe are relative to its folder, to the logs, or to the folder that these are in.
+    for place, home in (("data", ""), ("", "recipes"), ("data", "recipes")):
         read = read_logs(tmp_path / place, recipe, home=tmp_path / home)
         assert sorted(one.kind for one in read.episodes) == ["", "", "leak", "leak"]
     elsewhere = read_logs(tmp_path / "data/bad", recipe, home=tmp_path / "recipes")

@@ -159,7 +159,7 @@ def test_signs_holds_and_formulas(run, tmp_path):
     assert least == pytest.approx(max(speeds))
     assert run("logs", "--score", "|residual|", "-q").startswith("|residual| > 1.38 m")
     held = run("logs", "--score", "abs(residual)", "--hold", 2)
-    assert held.splitlines()[0].endswith(" m in 2 rows with a score in a row")
+    assert held.splitlines()[0].endswith(" m in 2 scores in a row")
     assert float(held.split()[2]) < 1
     text = run("logs", "--score", "residual", "--alarm", "cusum")
     assert text.startswith("cusum(residual) > ")
@@ -227,6 +227,36 @@ def test_logs_without_a_value_are_left_out_by_name(run, tmp_path):
     assert "Left out, as the score has no value there: run-04 and run-05." in text
 
 
+def test_of_a_state_and_an_action_with_one_name_either_can_be_named(run, tmp_path):
+    for i in range(20):
+        columns = {"obs:grip": signal(i).tolist(), "action:grip": (2 * signal(i)).tolist()}
+        write_table(tmp_path / "logs" / f"run-{i:02}.csv", columns)
+    message = run("logs", "--score", "grip", code=4)
+    assert "two sensors named 'grip': name one of obs:grip and action:grip" in message
+    assert run("logs", "--score", "obs:grip").startswith("obs:grip > 1.19")
+    assert run("logs", "--score", "action:grip").startswith("action:grip > 2.38")
+    assert "Known: grip\n" in run("logs", "--score", "speed", code=4)
+
+
+@pytest.mark.parametrize("write", [write_lerobot, write_csv])
+def test_a_recipe_elsewhere_finds_the_logs_that_are_named(write, run, tmp_path):
+    column = "chunk_mse" if write is write_lerobot else "residual"
+    write(tmp_path / "data" / "logs", range(20))
+    (tmp_path / "else").mkdir()
+    assert main(["data", "inspect", "data/logs", "--recipe", "else/arm.toml", "-q"]) == 0
+    text = run("data/logs", "--recipe", "else/arm.toml", "--score", column)
+    assert text.startswith(f"{column} > 1.19")
+    refused = run("else", "--recipe", "else/arm.toml", "--score", column, code=4)
+    assert "'else' holds no file that the recipe lists" in refused
+
+
+def test_one_file_of_a_recipe_is_one_log(run, tmp_path):
+    write_csv(tmp_path / "logs", range(20))
+    assert main(["data", "inspect", "logs", "--recipe", "arm.toml", "-q"]) == 0
+    few = run("logs/run-03.csv", "--recipe", "arm.toml", "--score", "residual", code=4)
+    assert "1 healthy log, too few" in few
+
+
 def test_training_and_calibration_episodes_of_a_split_are_healthy(run, tmp_path):
     parts = log_parts(train=9, calibration=10, nominal=8)
     write_log_split(tmp_path / "arm", parts)
@@ -244,6 +274,7 @@ def test_training_and_calibration_episodes_of_a_split_are_healthy(run, tmp_path)
         f"Of 5 logs with slip: {(firsts >= 30).sum()} alarm once it began, by a median delay of "
         f"{np.median(firsts[firsts >= 30]) - 30:g} rows; {(firsts < 30).sum()} before it began"
     ) in text
+    assert "field or column 'task'" in run("arm", "--score", "|q2|", "--per", "task", code=4)
     assert "keeps no field but the task" in run("arm", "--score", "|q2|", "--per", "frame", code=4)
 
 

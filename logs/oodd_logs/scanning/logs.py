@@ -68,8 +68,8 @@ def read_logs(
         Rows to which longer recordings are cut, in place of the recipe's. Without a recipe, 20
         recordings and more are left whole, and fewer are cut as ``data inspect`` advises.
     home
-        Folder of the recipe. Its files are relative to this where the logs are in it and no file
-        that it lists is relative to `path`.
+        Folder of the recipe. Its files are relative to the first of `path`, the folder that this is
+        in, and `home`, in which it lists any.
 
     Returns
     -------
@@ -87,9 +87,9 @@ def read_logs(
         files = [file for file in files if file != root / recipe.intervals]
     if window is not None:
         recipe = replace(recipe, window=window, nominal=replace(recipe.nominal, window=None))
-    if home is not None and files[0].is_relative_to(home):
-        listed = any(names_matching(pattern, root) for pattern in recipe.globs)
-        root = root if listed else home
+    folders = () if home is None else (root, path.parent, home)
+    globs = recipe.globs
+    root = next((f for f in folders if any(names_matching(glob, f) for glob in globs)), root)
     with read_every_episode(recipe, root, files) as source:
         ledger = logs.ledger if logs else Ledger()
         for ending, count in others.items():
