@@ -183,7 +183,8 @@ class EpisodeSource:
         """The ledger in short, a line each."""
         names = [quantity.name for quantity in self.sensors]
         sensors, scores = names[: self.measured], names[self.measured :]
-        return self.ledger.summary(sensors, self.recordings, scores)
+        lines = self.ledger.summary(sensors, self.recordings)
+        return [*lines[:1], *([f"scores: {listed(scores, 12)}"] if scores else []), *lines[1:]]
 
     @property
     def measured(self) -> int:
@@ -728,7 +729,10 @@ class _Reading:
             raise UsageError(problem)
         for problem in self.problems:
             raise TrajectoryError(problem)
-        self._check_unseen()
+        tasks = dict.fromkeys(f.episode.task for facts in self.parts.values() for f in facts)
+        check_known("task (unseen)", tasks, *sorted(self.unseen))
+        if self.unseen and self.unseen >= {*tasks}:
+            raise UsageError(f"unseen names all tasks, {', '.join(tasks)}: none is for training")
         failed = self._failed_for_training()
         parts = self._shared_out()
         for part in (part for part in (TRAIN, CALIBRATION) if not parts[part]):
@@ -755,22 +759,11 @@ class _Reading:
             source.notes.append(f"no episodes of these anomalies: {', '.join(lacking)}")
         return source
 
-    def _check_unseen(self) -> None:
-        """Raise `UsageError` unless there are the unseen tasks, and others."""
-        tasks = dict.fromkeys(f.episode.task for facts in self.parts.values() for f in facts)
-        check_known("task (unseen)", tasks, *sorted(self.unseen))
-        if self.unseen and self.unseen >= {*tasks}:
-            raise UsageError(f"unseen names all tasks, {listed([*tasks])}: none is for training")
-
     def _failed_for_training(self) -> list[EpisodeFacts]:
         """Take the first failed episodes of each task that is seen out of the parts of the test."""
-        failed = [
-            facts
-            for part, episodes in self.parts.items()
-            for facts in episodes
-            if part not in NOMINAL_ROLES and facts.episode.outcome is False
-            if facts.episode.task not in self.unseen
-        ]
+        tests = (facts for part, facts in self.parts.items() if part not in NOMINAL_ROLES)
+        seen = (f for facts in tests for f in facts if f.episode.task not in self.unseen)
+        failed = [facts for facts in seen if facts.episode.outcome is False]
         failed.sort(key=lambda facts: facts.begin if self.by_stamps else facts.first)
         taken: set[EpisodeFacts] = set()
         for task in {facts.episode.task for facts in failed}:

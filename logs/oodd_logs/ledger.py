@@ -200,9 +200,7 @@ class Ledger:
                     mine.count += entry.sources[source]
                     mine.sources[source] = entry.sources[source]
 
-    def summary(
-        self, sensors: Sequence[str], total: int = 0, scores: Sequence[str] = ()
-    ) -> list[str]:
+    def summary(self, sensors: Sequence[str], total: int = 0) -> list[str]:
         """Return the sensors with the columns that were left out, and the other entries, in lines.
 
         What concerns few recordings comes first; of very many entries some are left out.
@@ -213,13 +211,10 @@ class Ledger:
             Names of the sensors.
         total
             Number of recordings in all; 0 where that is not known.
-        scores
-            Names of the recorded scores.
         """
         left_out = sorted(self.of("column", "dropped"), key=lambda entry: len(entry.sources))
         columns = [f"{e.name} ({e.reason}{e.where(total)})" for e in left_out]
         line = f"sensors: {_some(sensors)}"
-        line += f"; scores: {_some(scores)}" if scores else ""
         line += f"; left out: {_some(columns)}" if columns else ""
         others = [entry for entry in self if entry not in left_out]
         lines = [e.line(total) for e in sorted(others, key=lambda entry: len(entry.sources))]

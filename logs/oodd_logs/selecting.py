@@ -8,7 +8,7 @@ import dataclasses
 import re
 import unicodedata
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain, product
@@ -243,14 +243,11 @@ def select_columns(layout: Layout, recipe: Recipe, source: str) -> Selection:
     rewards_text = (recipe.reward,) if recipe.reward else ()
     texts = {"obs": recipe.sensors, "action": recipe.actions, "reward": rewards_text}
     chosen = {kind: _listed(layout, names, source) for kind, names in texts.items()}
-    scores = [
-        dataclasses.replace(c, quantity=dataclasses.replace(c.quantity, role="score"))
-        for c in _listed(layout, recipe.scores, source)
-    ]
-    by_prefix = {} if recipe.sensors else _by_prefix(layout, source)
+    as_score = partial(dataclasses.replace, role="score")
+    columns = _listed(layout, recipe.scores, source)
+    scores = [dataclasses.replace(c, quantity=as_score(c.quantity)) for c in columns]
     are_scores = {(c.topic, c.column) for c in scores}
-    for kind, columns in by_prefix.items():
-        by_prefix[kind] = [c for c in columns if (c.topic, c.column) not in are_scores]
+    by_prefix = {} if recipe.sensors else _by_prefix(layout, source, are_scores)
     sensors, actions, rewards = (chosen[kind] or by_prefix.get(kind, []) for kind in texts)
     fields = [column for text in _texts_of(recipe) for column in find_columns(layout, text)]
     labels = {
@@ -258,16 +255,8 @@ def select_columns(layout: Layout, recipe: Recipe, source: str) -> Selection:
     }
     used = [*sensors, *actions, *rewards[:1], *labels.values()]
     for c in (c for c in used if (c.topic, c.column) in are_scores):
-        name = _aliases(c.topic, c.column)[-1]
-        raise UsageError(
-            f"{source}: {name!r} is a score, and a sensor, action, reward or label, too: name it "
-            "in one of these keys"
-        )
-    if not sensors:
-        raise UsageError(
-            f"{source}: all columns are scores, expected a sensor: name one of them as that, since "
-            "column:NAME takes both"
-        )
+        both = f"{_aliases(c.topic, c.column)[-1]!r} is a score, and a sensor, action, reward or"
+        raise UsageError(f"{source}: {both} label, too: name it in one of these keys")
     sensors, used = [*sensors, *scores], [*used, *scores]
     for kind, columns in (("sensors", sensors), ("actions", actions)):
         names = [column.quantity.name for column in columns]
@@ -306,10 +295,12 @@ def with_sensors(recipe: Recipe, recording: Recording) -> Recipe:
     return dataclasses.replace(recipe, sensors=sensors)
 
 
-def _by_prefix(layout: Layout, source: str) -> dict[str, list[ChosenColumn]]:
+def _by_prefix(
+    layout: Layout, source: str, scores: Collection[tuple[str, str]]
+) -> dict[str, list[ChosenColumn]]:
     """Return the columns ``obs:NAME[UNIT]``, ``action:NAME[UNIT]`` and ``reward``, by kind."""
     by_kind: dict[str, list[ChosenColumn]] = {"obs": [], "action": [], "reward": []}
-    for topic, name in _pairs(layout):
+    for topic, name in (pair for pair in _pairs(layout) if pair not in scores):
         match = _PREFIX.match(name)
         kind = match[1].lower() if match else name.strip().lower()
         if match or kind == "reward":
@@ -320,7 +311,8 @@ def _by_prefix(layout: Layout, source: str) -> dict[str, list[ChosenColumn]]:
         names = ", ".join(named_columns(layout))
         raise UsageError(
             f"{source} has the columns {names or 'none'}: none is called "
-            "obs:NAME[UNIT], so name the sensors in a recipe (sensors = [...]), actions, too"
+            "obs:NAME[UNIT] and is no score, so name the sensors in a recipe (sensors = [...]), "
+            "actions, too"
         )
     return by_kind
 

@@ -65,7 +65,7 @@ def test_a_score_is_kept_as_it_was_recorded_and_is_no_sensor(frames):
             assert episode.observations == pytest.approx(expected, rel=1e-6)
     text = "\n".join(notes)
     assert "3 sensors, 0 actions, 2 scores" in text
-    assert "sensors: height, sin yaw, cos yaw; scores: vel_innov, flag" in text
+    assert "sensors: height, sin yaw, cos yaw\nscores: vel_innov and flag" in text
     # A flag is never raised where all is well: it stays, and that is said.
     assert "scores that are constant in training, and kept: flag" in text
 
@@ -218,7 +218,7 @@ def test_an_export_has_the_failures_and_says_which_scores_it_lacks(tmp_path):
     ("keys", "expected"),
     [
         ({"unseen": ["3"]}, "unknown task .unseen. '3'.*0, 1, 2"),
-        ({"unseen": ["0", "1", "2"]}, "unseen names all tasks, 0, 1 and 2: none is for training"),
+        ({"unseen": ["0", "1", "2"]}, "unseen names all tasks, 0, 1, 2: none is for training"),
         ({"unseen": ["0"], "task": ""}, "unseen names tasks: name the field with them .task., too"),
         ({"failures": 0.5, "outcome": ""}, "failures are known by their outcome: name its field"),
         ({"failures": 2}, "failures is 2, expected a share from 0 to 1"),
@@ -319,9 +319,9 @@ def test_prefixed_columns_are_scores_too(tmp_path):
     assert (recipe.sensors, recipe.scores) == ((), ("obs:q_residual[rad]",))
     logs = read_logs(tmp_path)
     assert [(q.name, q.role) for q in logs.sensors] == [("q", "measured"), ("q_residual", "score")]
-    assert logs.notes[0] == "sensors: q; scores: q_residual"
+    assert logs.notes[:2] == ["sensors: q", "scores: q_residual"]
     recipe = Recipe("s", "s", scores=("obs:*",), nominal=recipe.nominal)
-    with pytest.raises(UsageError, match="all columns are scores, expected a sensor"):
+    with pytest.raises(UsageError, match=r"none is called obs:NAME\[UNIT\] and is no score"):
         import_recipe(recipe, tmp_path, tmp_path / "split")
 
 

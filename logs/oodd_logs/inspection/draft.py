@@ -146,8 +146,7 @@ def _draft_columns(logs: Inspection) -> Iterator[str]:
         for reason, names in remarks.items():
             yield from wrapper.wrap(f"left out, {reason}: {listed(names, 40)}")
     if logs.scores:
-        yield "# by name what a monitor computed: no sensors, but columns that are kept"
-        yield f"scores = {_several(logs.scores)}"
+        yield f"scores = {_several(logs.scores)}  # by name what a monitor computed: no sensors"
     for name, members in logs.kinds.items():
         used = {names: value for names, value in members.items() if {*names} <= {*sensors}}
         if line := line_of(kinds()[name], used):

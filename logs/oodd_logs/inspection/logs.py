@@ -305,9 +305,8 @@ class Inspection:
         usable = (recording for recording in self.recordings if recording.file in self.usable)
         partial = {n for r in usable for n in self._lacking(r) & self._candidates}
         roles = self._basic_roles | dict.fromkeys(partial, "partial")
-        if "" in roles.values():
-            return roles
-        return {name: role.replace("scores", "") for name, role in roles.items()}
+        of_scores = "scores" if "" in roles.values() else ""
+        return {name: of_scores if role == "scores" else role for name, role in roles.items()}
 
     @cached_property
     def _basic_roles(self) -> dict[str, str]:
@@ -431,16 +430,8 @@ class Inspection:
         if self.columns.keys() - used:
             # What only files have that are left out takes no part.
             self.columns = {n: facts for n, facts in self.columns.items() if n in used}
-            for name in (
-                "times",
-                "_stuck",
-                "labels",
-                "_scores",
-                "kinds",
-                "_basic_roles",
-                "_candidates",
-                "roles",
-            ):
+            cached = (n for n, x in vars(type(self)).items() if isinstance(x, cached_property))
+            for name in (name for name in cached if name != "usable"):
                 self.__dict__.pop(name, None)
         for name, role in self.roles.items():
             if role and role not in {"times", "labels", "scores"}:

@@ -39,10 +39,9 @@ ROLES: Final[Mapping[str, Role]] = {
         "{names}: stamps that often stand still are no times of rows: rows count as equally spaced",
     ),
     "scores": Role(
-        "what a monitor computed, by its name",
+        "",
         "score of a monitor",
-        "{names}: by name what a monitor computed, no sensor: write scores = [{first}]; oodd-eval "
-        "calibrate --score {first} makes a threshold of it",
+        "{names}: by name what a monitor computed: write scores = [{first}]",
     ),
     "empty": Role("no value in any row", "empty", "{names}: no value in any row; leave out"),
     "text": Role(

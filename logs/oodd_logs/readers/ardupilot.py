@@ -120,6 +120,4 @@ def _text(cell: bytes) -> str:
     return cell.partition(b"\0")[0].decode("utf-8", "replace")
 
 
-READER: Final = Reader(
-    "ardupilot", "a DataFlash log of ArduPilot", (".bin",), _open, options=TOPICS
-)
+READER: Final = Reader("ardupilot", "a log of ArduPilot", (".bin",), _open, options=TOPICS)
