@@ -241,11 +241,6 @@ def intervene(
         anomalies=kinds,
         parameters=parameters,
     )
-    if of_logs := next((unit.setting.detector for unit in plan.units if unit.columns), ""):
-        raise UsageError(
-            f"{of_logs} judges a column of logs, and a closed loop records none: expected "
-            "detectors that look at the sensors"
-        )
     offered = offered_acts(plugins)
     broken = {f"plug-in {b.plugin!r} of {b.distribution}": b.reason for b in plugins.broken}
     act_names = _selected(comma_list(acts or "all"), offered, broken)
