@@ -339,7 +339,7 @@ def _checked(scores: Sequence[ArrayLike], hold: int) -> list[Floats]:
     episodes = [as_numbers(s, f"episode {i} of the scores: ") for i, s in enumerate(scores)]
     for i, s in enumerate(episodes):
         if s.ndim != 1 or np.count_nonzero(~np.isnan(s)) < hold:
-            expected = f"a number a row, in {hold} rows at least: leave it out"
+            expected = f"a number a row, in {hold} rows at least (hold): leave it out"
             raise UsageError(f"episode {i} has scores of shape {s.shape}, expected {expected}")
     pooled = np.concatenate([np.zeros(0), *episodes])
     values = [f"{value:g}" for value in np.unique(pooled[~np.isnan(pooled)])]

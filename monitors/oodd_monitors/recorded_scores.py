@@ -20,7 +20,7 @@ from oodd_eval.data.facts import Quantity
 from oodd_eval.data.layout import MANIFEST
 from oodd_eval.data.parts import CALIBRATION, TRAIN, AnomalousSet, TrajectorySet
 from oodd_eval.data.split import Split, load_split
-from oodd_eval.errors import TrajectoryError, UsageError
+from oodd_eval.errors import TrajectoryError, UnknownNameError, UsageError
 from oodd_eval.names import counted, listed
 from oodd_monitors.calibrating import LabelledScores
 
@@ -53,7 +53,7 @@ class ScoreColumn(NamedTuple):
 
     def __call__(self, values: Floats, baseline: int) -> Floats:
         """Return the scores of an episode, NaN in the first rows that are a baseline."""
-        scores = self.sign * (np.abs(values) if self.size else values)
+        scores = self.sign * (np.abs(values) if self.size else values) + 0.0  # no -0
         scores[:baseline] = np.nan
         return scores
 
@@ -130,7 +130,13 @@ def read_scores(
     """
     path, column = Path(logs), ScoreColumn.of(score)
     if (path / MANIFEST).is_file() or not path.exists():
-        scores = _of_split(load_split(logs), column, per)
+        if recipe:
+            raise UsageError(f"--recipe is for logs, and {logs!r} is none that exists")
+        try:
+            split = load_split(logs)
+        except UnknownNameError as error:
+            raise UsageError(f"{logs!r} is no file or folder of logs, and an {error}") from None
+        scores = _of_split(split, column, per)
     else:
         scores = _of_logs(path, column, recipe, per)
     if per and {*scores.groups} <= {""}:

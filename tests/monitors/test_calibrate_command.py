@@ -250,6 +250,26 @@ def test_a_recipe_elsewhere_finds_the_logs_that_are_named(write, run, tmp_path):
     assert "'else' holds no file that the recipe lists" in refused
 
 
+def test_what_is_no_log_and_no_split_is_said(run, tmp_path):
+    write_csv(tmp_path / "logs", range(2))
+    assert "'log' is no file or folder of logs, and an unknown split" in run(
+        "log", "--score", "residual", code=4
+    )
+    (tmp_path / "arm.toml").write_text('split = "arm"\nnominal.files = ["*.csv"]\n')
+    refused = run("mini", "--recipe", "arm.toml", "--score", "residual", code=4)
+    assert "--recipe is for logs, and 'mini' is none" in refused
+    refused = run("logs", "--score", "residual", "--hold", ROWS + 1, code=4)
+    assert f"in {ROWS + 1} rows at least (hold)" in refused
+    (tmp_path / "empty").mkdir()
+    assert "--format, or a recipe, says" in run("empty", "--score", "residual", code=4)
+
+
+def test_a_negative_zero_is_zero(run, tmp_path):
+    for i in range(19):
+        write_table(tmp_path / "logs" / f"run-{i:02}.csv", {"rest": [0, 1, 2, i]})
+    assert run("logs", "--score=-rest").startswith("-rest > 0\n")
+
+
 def test_one_file_of_a_recipe_is_one_log(run, tmp_path):
     write_csv(tmp_path / "logs", range(20))
     assert main(["data", "inspect", "logs", "--recipe", "arm.toml", "-q"]) == 0

@@ -662,7 +662,7 @@ def recognised(path: Path, form: str) -> tuple[Reader, list[Path], Counter[str]]
         endings = ", ".join(sorted({s for reader in formats.values() for s in reader.suffixes}))
         raise UsageError(
             f"{str(path)!r} has no files of a known format, expected names that end in {endings}; "
-            "--format says which it is"
+            "--format, or a recipe, says which it is"
         )
     # Beside logs, JSON files hold settings, and .bin anything.
     others = {"json", "ardupilot"}
