@@ -326,6 +326,10 @@ gap of more than 0 rows without one'
             facts = calibration.smoothing, calibration.hold, calibration.longest_gap
         else:
             scores = [as_numbers(x, f"episode {i}: ") for i, x in enumerate(calibration)]
+            for i, x in enumerate(scores):
+                if x.ndim != 1 or np.isnan(x).all():
+                    expected = "expected a number a row, one at least"
+                    raise UsageError(f"episode {i} has scores of shape {x.shape}, {expected}")
             fitted, level = Calibration.fit(scores, "column"), 0.05
             facts = None, 1, max(map(longest_gap, scores), default=0)
         alpha = level if alpha is None else alpha

@@ -220,6 +220,9 @@ def test_what_is_no_score_is_an_error_and_names_are_taken():
     for few in ([], HEALTHY[:18]):
         with pytest.raises(UsageError, match=f"takes 19 calibration episodes, got {len(few)}"):
             Watchdog.of_scores(few)
+    for wrong in (HEALTHY[0], [np.ones((9, 2))] * 40, [[np.nan] * 9] * 40):
+        with pytest.raises(UsageError, match=r"episode 0 has scores of shape .* a number a row"):
+            Watchdog.of_scores(wrong)
     for alpha in (0.0, 1.0):
         with pytest.raises(UsageError, match="expected shares between 0 and 1"):
             Watchdog.of_scores(HEALTHY, alpha)
