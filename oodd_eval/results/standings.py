@@ -219,7 +219,9 @@ def verdict_of(board: Board, level: str = "") -> str:
         records = [r for r in board.records if r.setting in rows[:2] and r.ok]
         with contextlib.suppress(ResultsError):  # without a cell in common
             return compare_rows(records, str(rows[0]), str(rows[1]), board.ranking).verdict
-    return _in_words(board, (rows or board.entries)[0], level or board.level)
+    first = (rows or board.entries)[0]
+    # Of several rows that nothing ranks none speaks for the others.
+    return _in_words(board, first, level or board.level) if rows or len(board.entries) == 1 else ""
 
 
 def _in_words(board: Board, entry: Setting, level: str) -> str:

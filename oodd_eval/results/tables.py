@@ -341,7 +341,7 @@ class Tables:
             candidates += [self._alarms(), self._outcomes(), self._nominal(), self._apart()]
             candidates += [self._alarms([name]) for name in single]
         elif not ranks:
-            candidates.append(self._nominal())
+            candidates += [self._alarms(), self._nominal()]
         elif self.board.ranking != OUTCOME:
             candidates.append(self._outcomes())
         if self._present(ROWS):

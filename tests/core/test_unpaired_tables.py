@@ -499,3 +499,15 @@ def test_compare_reads_records_without_twins_and_writes_junit(tmp_path, capsys):
     capsys.readouterr()
     assert main(["compare", now, "mewma", "rf"]) == 0
     assert "pooled AUC: mewma 66.7 %, rf 50.0 %" in capsys.readouterr().out
+
+
+def test_alarms_are_shown_where_no_row_can_be_ranked():
+    """Of few nominal test episodes none is compared: no row is picked to speak for the others."""
+    values = {"missed_at_5pct": 0.25, "false_episodes_at_5pct": 0.5}
+    records = [log_record(name, values=values) for name in ("flag:x[0]", "column:abs(x)")]
+    (section,) = Report(records, detail="brief").sections
+    (table,) = section.tables
+    assert [row[0] for row in table.rows] == ["column:abs(x)", "flag:x[0]"]
+    assert not section.verdict
+    (alone,) = Report(records[:1], detail="brief").sections
+    assert alone.verdict.startswith("flag:x[0] on arm: with alarms in at most 5 %")
