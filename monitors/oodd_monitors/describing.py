@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator
 from dataclasses import asdict
-from typing import Any
+from typing import Any, Final
 
 from oodd_eval.metrics.alarms import least_episodes
 from oodd_eval.metrics.binomial import clopper_pearson
@@ -11,6 +11,9 @@ from oodd_eval.metrics.catalogue import LEVELS
 from oodd_eval.metrics.cusum import DRIFT, UNIT
 from oodd_eval.names import counted
 from oodd_monitors.calibrating import Detections, ScoreCalibration
+
+_DRIFT_FROM: Final = 6
+"""Logs of which an order can be rare: both orders of 5 have p = 2/120, which is above 1 %."""
 
 
 def condition(calibration: ScoreCalibration, name: str, unit: str = "") -> str:
@@ -91,6 +94,8 @@ def sentences(calibration: ScoreCalibration, name: str) -> Iterator[str]:
     )
     test = calibration.drift
     steady = f"No drift seen (rank correlation {test.statistic:.2f}, p = {test.p:.2g})."
+    if basis.recording_count < _DRIFT_FROM:
+        steady = f"Drift shows in {_DRIFT_FROM} logs and more."
     yield from calibration.notes or [steady]
     if calibration.healthy:
         alarms, n = calibration.false_alarms, calibration.healthy

@@ -139,7 +139,7 @@ def read_scores(
         scores = _of_split(split, column, per)
     else:
         scores = _of_logs(path, column, recipe, per)
-    if per and {*scores.groups} <= {""}:
+    if per and scores.scores and {*scores.groups} <= {""}:
         raise UsageError(f"no healthy log has a field or column {per!r}, which --per names")
     return scores
 
@@ -205,6 +205,9 @@ def _notes(source: EpisodeSource, scores: RecordedScores, silent: Sequence[str])
     """Yield what was read, and what was left out."""
     if not scores.labelled:
         yield "Nothing says that a log is anomalous: all count as healthy."
+    elif not scores.scores:
+        count = counted(len(scores.labelled), "log(s)")
+        yield f"Labels make all {count} anomalous: a recipe (--recipe FILE) names others."
     if silent:
         yield f"Left out, as the score has no value there: {listed(silent)}."
     dropped = [e for e in source.ledger if e.fate == "dropped" and e.item in {"file", "recording"}]

@@ -264,6 +264,24 @@ def test_what_is_no_log_and_no_split_is_said(run, tmp_path):
     assert "--format, or a recipe, says" in run("empty", "--score", "residual", code=4)
 
 
+def test_logs_that_labels_make_anomalous_are_said(run, tmp_path):
+    write_csv(tmp_path / "logs", range(6), fault=lambda _: 1, airframe=lambda _: "quad")
+    (tmp_path / "arm.toml").write_text(
+        'split = "arm"\nsensors = ["speed"]\nlabels = "fault"\nnominal.files = ["*.csv"]\n'
+    )
+    arguments = ("logs", "--recipe", "arm.toml", "--score", "residual", "--per", "airframe")
+    refused = run(*arguments, code=4)
+    assert "0 healthy logs, too few for 5 %" in refused
+    assert "Labels make all 6 logs anomalous: a recipe" in refused
+
+
+def test_few_logs_show_no_drift(run, tmp_path):
+    write_csv(tmp_path / "logs", range(5))
+    assert "Drift shows in 6 logs and more." in run("logs", "--score", "residual", "--level", 20)
+    write_csv(tmp_path / "logs", range(6))
+    assert "rank correlation" in run("logs", "--score", "residual", "--level", 20)
+
+
 def test_a_negative_zero_is_zero(run, tmp_path):
     for i in range(19):
         write_table(tmp_path / "logs" / f"run-{i:02}.csv", {"rest": [0, 1, 2, i]})
