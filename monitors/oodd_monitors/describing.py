@@ -75,8 +75,8 @@ def sentences(calibration: ScoreCalibration, name: str) -> Iterator[str]:
     if interval := calibration.share_interval:
         scaling = ", others scale it" if kind == "cusum" else ""
         yield (
-            f"The true share at this threshold is {_percent(*interval)} (95 % interval, from {n} "
-            f"healthy logs{scaling})."
+            f"The true share at this threshold is {_percent(*interval)} (95 % interval, from "
+            f"{counted(n, 'healthy log(s)')}{scaling})."
         )
     for level in (level for level in LEVELS.values() if level <= calibration.level):
         least = least_episodes(level, kind)

@@ -275,6 +275,13 @@ def test_logs_that_labels_make_anomalous_are_said(run, tmp_path):
     assert "Labels make all 6 logs anomalous: a recipe" in refused
 
 
+def test_one_log_is_one(run, tmp_path):
+    write_csv(tmp_path / "logs", range(1))
+    text = run("logs", "--score", "residual", "--level", 50)
+    assert "from 1 healthy log)." in text
+    assert 'default: ""' not in run("--help")
+
+
 def test_few_logs_show_no_drift(run, tmp_path):
     write_csv(tmp_path / "logs", range(5))
     assert "Drift shows in 6 logs and more." in run("logs", "--score", "residual", "--level", 20)

@@ -28,10 +28,12 @@ _ALARMS = click.Choice(get_args(ScoreAlarm))
 )
 @click.argument("logs", type=Name("splits"))
 @click.option("--score", required=True, metavar="COLUMN", help="NAME, -NAME, or |NAME|")
-@click.option("--level", default=5.0, type=_PERCENT, help="of healthy logs may alarm, at most")
+@click.option(
+    "--level", default=5.0, type=_PERCENT, help="per cent of healthy logs that may alarm, at most"
+)
 @click.option("--alarm", default="threshold", type=_ALARMS, help="statistic of the score")
 @click.option("--hold", default=1, type=COUNT, help="rows in a row above the threshold")
-@click.option("--per", metavar="GROUP", default="", help="a threshold for each value of a field")
+@click.option("--per", metavar="GROUP", help="a threshold for each value of a field")
 @click.option("--recipe", type=FILE, help="how the logs are read, whose files are below LOGS")
 @click.option("--json", is_flag=True, help="print everything as JSON")
 def calibrate_score(options: Options) -> int:
@@ -42,7 +44,7 @@ def calibrate_score(options: Options) -> int:
     log; windows of one recording count once. Nothing is fitted.
     """
     register_formats(options)
-    scores = read_scores(options.logs, options.score, recipe=options.recipe, per=options.per)
+    scores = read_scores(options.logs, options.score, recipe=options.recipe, per=options.per or "")
     level, alarm, hold = options.level / 100, options.alarm, options.hold
     try:
         calibration = calibrate(**scores.arguments, level=level, alarm=alarm, hold=hold)
