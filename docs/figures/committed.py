@@ -9,7 +9,7 @@ from oodd_leaderboard.pages import Leaderboard, read_leaderboard
 from oodd_leaderboard.standings import primary_settings
 
 from oodd_eval.results.board import Board, boards
-from oodd_eval.results.directory import ResultsDirectory
+from oodd_eval.results.directory import ResultsDirectory, read_records
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
 
@@ -17,6 +17,7 @@ ROOT = Path(__file__).parents[2]
 BOARD = ROOT / "leaderboard"
 README, RESULTS = ROOT / "README.md", ROOT / "docs" / "results.md"
 INTERVENTIONS = ROOT / "docs" / "interventions.md"
+FAILURES = ROOT / "docs" / "failures.md"
 
 Row = Callable[[str], str]
 """Return the cells of a row behind its first one, separated by bars, from what the first names."""
@@ -118,3 +119,10 @@ def overview(suite: str, name: str) -> list[str]:
 def claims(split: str) -> dict[tuple[str, str], dict[str, str]]:
     """Return the judgements of a reproduction by claim and measure."""
     return {(r["claim"], r["kind"]): r for r in lines(f"reproduction/{split}/claims.csv")}
+
+
+@functools.cache
+def rollouts() -> dict[str, Board]:
+    """Return the boards of rows on rollouts of a learned policy, by split, see `failures.py`."""
+    records = read_records(Path(__file__).with_name("failures.jsonl.xz"))
+    return {board.split: board for board in boards(records)}

@@ -7,7 +7,17 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any, Final
 
 import numpy as np
-from committed import RESULTS, board, claims, lines, mean, of_reproductions, overview, ranking
+from committed import (
+    RESULTS,
+    board,
+    claims,
+    lines,
+    mean,
+    of_reproductions,
+    overview,
+    ranking,
+    rollouts,
+)
 
 from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_eval.results.identity import Setting
@@ -227,6 +237,20 @@ ENDS = ("value", "low", "high")
 EASIER = "sensor-above-dynamics-models"
 
 
+def false_among_successes(row: str) -> list[int]:
+    """Return how many successful test rollouts a row alarms in at 10 %, and of how many."""
+    board = rollouts()["pi0-failures"]
+    (cell, *_) = (r for r in board.records if r.detector == row)
+    count = cell.counts["nominal"]
+    return [round(count * cell.value("false_episodes_at_10pct")), count]
+
+
+def test_rollouts() -> list[int]:
+    """Return the numbers of successful and of failed test rollouts within tasks."""
+    counts = rollouts()["pi0-failures"].records[0].counts
+    return [counts["nominal"], counts["test"]]
+
+
 SENTENCES: list[tuple[str, Callable[[], Iterable[Any]]]] = [
     ("`rf` gains {} points of matched AUC there, `riqn-r` {}, `riqn-ms` {} and `npn` {}.",
      lambda: gains(10, ROBOTS, STEPS)),
@@ -322,6 +346,9 @@ SENTENCES: list[tuple[str, Callable[[], Iterable[Any]]]] = [
     (("`{}` by {} points of matched AUC over all cells, `{}` by {}, the other rows by at most "
       "{}."),
      between_seeds),
+    ("with `column:chunk_mse`, {} of the {} successful test episodes where 10 % were promised",
+     lambda: false_among_successes("column:chunk_mse")),
+    ("test parts of {} successful and {} failed episodes.", test_rollouts),
 ]  # fmt: skip
 """Phrases of the page with the numbers that they have to have."""
 
@@ -337,8 +364,9 @@ SETTINGS = (
     r"within (?:20|100) (?:control )?(?:steps|rows)|most 300 (?:steps|transitions)",
     r"(?:[Pp]rotocol|Tables?|Fern) \d+(?: (?:to|and) \d+)?|Python 3\.11",
     r"50 % is chance|longer after 150 steps|first 60 rows|1, 5, 10, 25 and 100 %",
-    r"10 test episodes each|where 5 % were promised|let the loss grow by 25 %|Alarms at 5 %",
+    r"10 test episodes each|where (?:5|10) % were promised|let the loss grow by 25 %|Alarms at 5 %",
     r"600 times cheaper",  # says another paper
+    r"(?:CoRL|RSS|NeurIPS) \d{4}|arXiv \d{4}\.\d{5}|tasks: 0, 2, 5 and 8|95 % interval",
 )
 """What the reader is told of the settings and by others, which no result decides."""
 

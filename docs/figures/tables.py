@@ -24,6 +24,7 @@ from unittest.mock import patch
 import sentences
 from committed import (
     BOARD,
+    FAILURES,
     INTERVENTIONS,
     README,
     RESULTS,
@@ -38,6 +39,7 @@ from committed import (
     overview,
     primary,
     ranking,
+    rollouts,
 )
 from oodd_interventions.columns import ALL, COLUMNS, row_of
 from oodd_interventions.page import sections
@@ -45,13 +47,14 @@ from oodd_leaderboard.pages import documents
 
 from oodd_eval.cli.main import main as oodd_eval
 from oodd_eval.data.files import read_text
-from oodd_eval.results.board import Board, boards
+from oodd_eval.metrics.catalogue import metric_info
+from oodd_eval.results.board import Board, Column, boards
 from oodd_eval.results.directory import ResultsDirectory, read_records
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.strengths import DETECTION, Strengths
 from oodd_eval.results.tables import Tables
 
-PAGES = (README, RESULTS, INTERVENTIONS)
+PAGES = (README, RESULTS, INTERVENTIONS, FAILURES)
 
 MAIN = Path(__file__).with_name("main.jsonl.xz")
 """Records of the README's main command: ``records.jsonl`` of its results."""
@@ -259,6 +262,39 @@ def worth(place: str) -> str:
     )
 
 
+OUTCOMES = ("auc_outcome", "auc_outcome_half", "auc_outcome_whole")
+ALARMS = ("found_outcome", "false_episodes", "balanced_outcome", "outcome_time")
+
+
+def on_rollouts(name: str, split: str, metrics: Iterable[str], environments: Iterable[str]) -> str:
+    """Return metrics of a row, the first with its interval, and the first in each environment."""
+    board, entry, (first, *others) = rollouts()[split], Setting(name), metrics
+    whole = board.of(entry, Column(first, intervals=True))
+    text = metric_info(first).text
+    further = [(metric_info(metric).text, Column(metric)) for metric in others]
+    further += [(text, Column(first, "", [environment])) for environment in environments]
+    values = [write(board.of(entry, column).value) for write, column in further]
+    return " | ".join([f"{text(whole.value)} [{text(whole.low)}, {text(whole.high)}]", *values])
+
+
+def within_tasks(name: str) -> str:
+    """Return what a row finds of failures of tasks that training has, see `failures.py`."""
+    return on_rollouts(name, "pi0-failures", [*OUTCOMES, "brier_outcome"], [])
+
+
+def alarms_within_tasks(name: str) -> str:
+    """Return what the alarms of a row find there, at 10 %."""
+    board, entry = rollouts()["pi0-failures"], Setting(name)
+    infos = [metric_info(f"{metric}_at_10pct") for metric in ALARMS]
+    return " | ".join(info.text(board.of(entry, Column(info.name)).value) for info in infos)
+
+
+def unseen_tasks(name: str) -> str:
+    """Return what a row finds of failures of tasks that training lacks, see `failures.py`."""
+    metrics = ("auc_outcome", "auc_outcome_half", "brier_outcome")
+    return on_rollouts(name, "pi0-unseen", metrics, rollouts()["pi0-unseen"].environments)
+
+
 def verdicts(text: str) -> str:
     """Return the verdicts on a claim, by the paper's measure and by the fair one."""
     by_text = {(r["text"], kind): r["verdict"] for (_, kind), r in claims("mini").items()}
@@ -293,6 +329,9 @@ TABLES: dict[str, Row] = {
     "switch costs": of_study("What switch prevents"),
     "stop harmless": of_study("Faults that stop cannot mend"),
     "namings": of_study("Parts named"),
+    "outcomes within": within_tasks,
+    "outcomes alarms": alarms_within_tasks,
+    "outcomes unseen": unseen_tasks,
     "worth": worth,
 }
 
