@@ -395,7 +395,7 @@ def test_a_mixture_of_two_groups_is_their_means_and_covariances():
     shares, centres, roots, inverse = _mixture(z, members)
     laws = [stats.multivariate_normal(g.mean(0), np.cov(g.T, bias=True)) for g in groups]
     density = 0.25 * laws[0].pdf(z) + 0.75 * laws[1].pdf(z)
-    found = energy(z.numpy(), shares.numpy(), centres.numpy(), roots.numpy(), np, np.matmul)
+    found = energy(z.numpy(), shares.numpy(), centres.numpy(), roots.numpy(), np)
     np.testing.assert_allclose(found, -np.log(density), rtol=1e-4)
     assert float(inverse) == pytest.approx(sum((1 / g.var(axis=0)).sum() for g in groups), rel=1e-4)
 
@@ -408,7 +408,7 @@ def test_features_of_a_reconstruction_by_hand():
         for n, shape in enumerate(pairwise(sizes)):
             w[f"{name}_{n}"], w[f"{name}_{n}_bias"] = np.zeros(shape), np.zeros(shape[1])
             w[f"{name}_{n}"][0, 0] = 1.0
-    z, again = encoded(np.array([[3.0, 4.0]]), w, np, np.matmul)
+    z, again = encoded(np.array([[3.0, 4.0]]), w, np)
     code = np.tanh(np.tanh(np.tanh(3.0)))
     decoded = np.tanh(np.tanh(np.tanh(code)))
     np.testing.assert_allclose(again, [[decoded, 0.0]])
@@ -422,9 +422,9 @@ def test_the_energy_of_a_window_is_that_of_torch(fitted):
     rows = (x.observations[:, :2] - detector.scale_.mean[:2]) / detector.scale_.std[:2]
     latest = np.hstack([rows[np.maximum(np.arange(60) - k, 0)] for k in range(3)])
     w = {n: torch.from_numpy(v) for n, v in detector.weights_.items()}
-    z, _ = encoded(torch.from_numpy(latest), w, torch, torch.matmul)
+    z, _ = encoded(torch.from_numpy(latest), w, torch)
     roots = w["roots"].reshape(2, 4, 4)
-    expected = energy(z, w["shares"][0], w["centres"], roots, torch, torch.matmul)
+    expected = energy(z, w["shares"][0], w["centres"], roots, torch)
     np.testing.assert_allclose(detector.score(x), expected, rtol=1e-5, atol=1e-5)
 
 

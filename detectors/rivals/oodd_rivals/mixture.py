@@ -6,10 +6,9 @@ After Zong, Song, Min, Cheng, Lumezanu, Cho and Chen (ICLR 2018).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial, reduce
+from collections.abc import Mapping, Sequence
+from functools import reduce
 from itertools import pairwise
-from operator import matmul
 from typing import Any, ClassVar, Final
 
 import numpy as np
@@ -97,10 +96,9 @@ class DeepMixture(NetworkRival):
 
     def _energies(self, x: Floats, observations: NDArray[np.float32]) -> Floats:
         w = self.weights_
-        blocks = partial(product, block=BLOCK)
-        z, _ = encoded(np.clip(x, -LIMIT, LIMIT), w, np, blocks)
+        z, _ = encoded(np.clip(x, -LIMIT, LIMIT), w, np)
         roots = w["roots"].reshape(-1, *[z.shape[1]] * 2)
-        energies: Floats = energy(z, w["shares"][0], w["centres"], roots, np, blocks)
+        energies: Floats = energy(z, w["shares"][0], w["centres"], roots, np)
         return energies + 0.5 * self.surprise_ * self._moved(observations)
 
     def _train(self, training: Sequence[Floats], held_out: Sequence[Floats]) -> None:
@@ -149,37 +147,36 @@ class DeepMixture(NetworkRival):
 # What follows takes arrays of NumPy or torch, as `library` says
 
 
-def encoded(
-    x: Any, w: Mapping[str, Any], library: Any, multiply: Callable[[Any, Any], Any]
-) -> tuple[Any, Any]:
+def encoded(x: Any, w: Mapping[str, Any], library: Any) -> tuple[Any, Any]:
     """Return codes with the features of reconstructions, (N, C + 2), and these, from (N, I)."""
-    code = layers(x, w, "encode", library, multiply)
-    again = layers(code, w, "decode", library, multiply)
+    code = layers(x, w, "encode", library)
+    again = layers(code, w, "decode", library)
     size, other, far = (library.sqrt((v**2).sum(1) + LEAST**2) for v in (x, again, x - again))
     cosine = (x * again).sum(1) / (size * other)
     return library.hstack([code, (far / size)[:, None], cosine[:, None]]), again
 
 
-def layers(
-    x: Any, w: Mapping[str, Any], name: str, library: Any, multiply: Callable[[Any, Any], Any]
-) -> Any:
+def layers(x: Any, w: Mapping[str, Any], name: str, library: Any) -> Any:
     """Return what layers of one network make of x: tangents, and nothing on the last."""
     count = len(WIDTHS) + 1
     for n in range(count):
-        x = multiply(x, w[f"{name}_{n}"]) + w[f"{name}_{n}_bias"]
+        x = _times(x, w[f"{name}_{n}"]) + w[f"{name}_{n}_bias"]
         x = library.tanh(x) if n < count - 1 else x
     return x
 
 
-def energy(
-    z: Any, shares: Any, centres: Any, roots: Any, library: Any, multiply: Callable[[Any, Any], Any]
-) -> Any:
+def energy(z: Any, shares: Any, centres: Any, roots: Any, library: Any) -> Any:
     """Return minus the log density of points (N, M) under a mixture, see `_mixture`."""
     logs = [
-        share - 0.5 * (multiply(z - centre, root) ** 2).sum(1)
+        share - 0.5 * (_times(z - centre, root) ** 2).sum(1)
         for share, centre, root in zip(shares, centres, roots, strict=True)
     ]
     return -reduce(library.logaddexp, logs)
+
+
+def _times(x: Any, matrix: Any) -> Any:
+    """Return a product whose rows have the same bits however many there are, outside training."""
+    return x @ matrix if isinstance(x, Tensor) else product(x, matrix, BLOCK)
 
 
 # The training
@@ -190,7 +187,7 @@ def _loss(weights: Mapping[str, Tensor], x: Tensor, noise: torch.Generator | Non
     z, again, members = _memberships(weights, x, noise)
     z = z.double()  # a covariance of single precision may have no root
     shares, centres, roots, inverse = _mixture(z, members.double())
-    mean: Tensor = energy(z, shares, centres, roots, torch, matmul).mean()
+    mean: Tensor = energy(z, shares, centres, roots, torch).mean()
     return (x - again).square().sum(1).mean() + ENERGY * mean + SINGULAR * inverse
 
 
@@ -199,7 +196,7 @@ def _memberships(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return points (N, M), reconstructions (N, I) and shares of components in points (N, K)."""
     w = {name: weight[0] for name, weight in weights.items()}
-    z, again = encoded(x, w, torch, matmul)
+    z, again = encoded(x, w, torch)
     hidden = torch.tanh(z @ w["choose_0"] + w["choose_0_bias"])
     if noise is not None:
         kept = torch.rand(hidden.shape, generator=noise) >= DROPPED
