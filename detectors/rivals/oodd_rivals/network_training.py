@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import Final
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Final
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from oodd_common.charts import Floats
 from oodd_torch.optimizers import Adam, Average, Muon
+from oodd_torch.training import Schedule, batches
 from torch import Tensor
 
 from oodd_eval.plugins.forecasting import CONSTANT
@@ -110,6 +111,27 @@ def _copies(tensors: Sequence[Tensor]) -> list[Tensor]:
 def _set(tensors: Sequence[Tensor], values: Sequence[Tensor]) -> None:
     for t, value in zip(tensors, values, strict=True):
         t.copy_(value)
+
+
+def pieces_of(
+    episodes: Sequence[NDArray[np.float32]], parameters: Any, seed: int
+) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """Yield batches of pieces of episodes for ever, as `oodd_torch.training.batches` does."""
+    p, rng = parameters, np.random.default_rng([seed, 1])
+    return batches(episodes, [rng], 1, Schedule(p.updates, p.batch, p.chunk, 1, widths=(1.0,)))
+
+
+def left_to_forecast(
+    pairs: tuple[Floats, Floats], base: Floats, unit: Floats
+) -> NDArray[np.float32]:
+    """Return inputs and, one row later, what a linear forecast leaves in its units: (N + 1, I + D).
+
+    From inputs (N, I), what is forecast (N, D) and what `ridge` returned.
+    """
+    x, changes = pairs
+    y = (changes - x @ base[:-1] - base[-1]) / unit
+    columns = np.pad(x, ((0, 1), (0, 0))), np.pad(y, ((1, 0), (0, 0)))
+    return np.concatenate(columns, axis=1).astype(np.float32)
 
 
 def side_by_side(episodes: Sequence[NDArray[np.float32]]) -> tuple[Tensor, Tensor]:

@@ -13,13 +13,20 @@ import torch
 from numpy.typing import NDArray
 from oodd_common.charts import Floats
 from oodd_torch.gru import Sequence as GruSequence
-from oodd_torch.training import Schedule, batches
 from torch import Tensor
 from torch.nn.functional import silu as torch_silu
 
 from oodd_eval import Trajectory
 from oodd_rivals.network_parameters import RaptParameters
-from oodd_rivals.network_training import arrays_of, draw, minimize, ridge, side_by_side
+from oodd_rivals.network_training import (
+    arrays_of,
+    draw,
+    left_to_forecast,
+    minimize,
+    pieces_of,
+    ridge,
+    side_by_side,
+)
 from oodd_rivals.networks import LIMIT, SHRINK, NetworkRival, Shapes, gru_step, settings, silu
 
 LOG_SCALE: Final = 12.0
@@ -90,9 +97,8 @@ class RecurrentForecast(NetworkRival):
         base, unit = ridge(inputs, changes)
         commands = inputs.shape[1] - d
         weights = draw(self._network_shapes(d, commands), self.seed)
-        schedule = Schedule(p.updates, p.batch, p.chunk, levels=1, widths=(1.0,))
-        rng = np.random.default_rng([self.seed, 1])
-        chunks = batches([self._packed(e, base, unit) for e in training], [rng], 1, schedule)
+        packed = [left_to_forecast(self._pairs(e), base, unit) for e in training]
+        chunks = pieces_of(packed, p, self.seed)
         memory = torch.zeros(1, p.batch, p.units)
 
         def loss(update: int) -> Tensor:
@@ -105,7 +111,8 @@ class RecurrentForecast(NetworkRival):
                 return 0.3 * surprise.mean() + 3.0 * error.square().clamp(max=25.0).mean()
             return surprise.mean()
 
-        rows, counts = side_by_side([self._packed(e, base, unit) for e in held_out])
+        packed = [left_to_forecast(self._pairs(e), base, unit) for e in held_out]
+        rows, counts = side_by_side(packed)
         never = torch.zeros(1, *counts[1:].shape, dtype=torch.bool)
 
         def held_out_loss() -> Tensor:
@@ -126,14 +133,6 @@ class RecurrentForecast(NetworkRival):
         self.weights_["calibration"] = np.maximum(size, LEAST)
         scales = np.concatenate([self._forecasts(e)[1] for e in held_out])
         self.loss_ = float((0.5 * residuals**2 + scales).sum() / max(1, scales.size))
-
-    def _packed(self, episode: Floats, base: Floats, unit: Floats) -> NDArray[np.float32]:
-        """Return inputs and, one row later, what is left to forecast: (N + 1, I + D)."""
-        x, change = self._pairs(episode)
-        y = (change - x @ base[:-1] - base[-1]) / unit
-        return np.concatenate(
-            [np.pad(x, ((0, 1), (0, 0))), np.pad(y, ((1, 0), (0, 0)))], axis=1
-        ).astype(np.float32)
 
     def _pairs(self, episode: Floats) -> tuple[Floats, Floats]:
         """Return inputs (N, I) and changes over the horizon (N, D), from `_standard` rows."""

@@ -12,12 +12,19 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from oodd_common.charts import Floats, product, whitening
-from oodd_torch.training import Schedule, batches
 from torch import Tensor
 
 from oodd_eval import Trajectory
 from oodd_rivals.network_parameters import LstmParameters
-from oodd_rivals.network_training import arrays_of, draw, minimize, ridge, side_by_side
+from oodd_rivals.network_training import (
+    arrays_of,
+    draw,
+    left_to_forecast,
+    minimize,
+    pieces_of,
+    ridge,
+    side_by_side,
+)
 from oodd_rivals.networks import BLOCK, LIMIT, SHRINK, NetworkRival, Shapes, settings
 
 LAYERS: Final = 2
@@ -121,9 +128,8 @@ class StackedLstm(NetworkRival):
         rows, changes = (np.concatenate(v) for v in zip(*map(self._pairs, training), strict=True))
         base, unit = ridge(rows, changes)
         weights = draw(self._network_shapes(d), self.seed)
-        schedule = Schedule(p.updates, p.batch, p.chunk, levels=1, widths=(1.0,))
-        rng = np.random.default_rng([self.seed, 1])
-        chunks = batches([self._packed(e, base, unit) for e in training], [rng], 1, schedule)
+        packed = [left_to_forecast(self._pairs(e), base, unit) for e in training]
+        chunks = pieces_of(packed, p, self.seed)
         memory = torch.zeros(LAYERS, 2, p.batch, p.units)
 
         def loss(update: int) -> Tensor:  # noqa: ARG001
@@ -132,7 +138,8 @@ class StackedLstm(NetworkRival):
             outputs, memory = _outputs(weights, x[..., :d], memory, starts)
             return (y[..., d:] - outputs).square().mean()
 
-        unseen, counts = side_by_side([self._packed(e, base, unit) for e in held_out])
+        packed = [left_to_forecast(self._pairs(e), base, unit) for e in held_out]
+        unseen, counts = side_by_side(packed)
         empty, never = torch.zeros(LAYERS, 2, len(held_out), p.units), counts < 0
 
         def held_out_loss() -> Tensor:
@@ -156,13 +163,6 @@ class StackedLstm(NetworkRival):
         n, h = len(episode) - self.reach, self.horizon
         changes = [episode[h + j :][:n] - episode[:n] for j in range(self.parameters.steps)]
         return np.clip(episode[:n], -LIMIT, LIMIT), np.concatenate(changes, axis=1)
-
-    def _packed(self, episode: Floats, base: Floats, unit: Floats) -> NDArray[np.float32]:
-        """Return inputs and, one row later, what is left to forecast: (N + 1, D + L D)."""
-        x, changes = self._pairs(episode)
-        y = (changes - x @ base[:-1] - base[-1]) / unit
-        packed = np.pad(x, ((0, 1), (0, 0))), np.pad(y, ((1, 0), (0, 0)))
-        return np.concatenate(packed, axis=1).astype(np.float32)
 
     def _network_shapes(self, sensors: int) -> Shapes:
         h, errors = self.parameters.units, self.parameters.steps * sensors

@@ -14,12 +14,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from oodd_common.charts import Floats
-from oodd_torch.training import Schedule, batches
 from torch import Tensor
 
 from oodd_eval import Trajectory
 from oodd_rivals.network_parameters import WorldModelParameters
-from oodd_rivals.network_training import arrays_of, draw, minimize, ridge, side_by_side
+from oodd_rivals.network_training import arrays_of, draw, minimize, pieces_of, ridge, side_by_side
 from oodd_rivals.networks import LIMIT, SHRINK, NetworkRival, Shapes, gru_step, settings, silu
 from oodd_rivals.world_training import LOG_SCALE, Training
 
@@ -122,10 +121,8 @@ class WorldModel(NetworkRival):
         base, unit = ridge(x, changes)
         weights = draw(self._network_shapes(v, x.shape[1] - v), self.seed)
         trained = Training(weights, base, unit, p.noise, v)
-        schedule = Schedule(p.updates, p.batch, p.chunk, levels=1, widths=(1.0,))
-        rng = np.random.default_rng([self.seed, 1])
-        pieces = [np.clip(e, -LIMIT, LIMIT).astype(np.float32) for e in training]
-        chunks = batches(pieces, [rng], 1, schedule)
+        clipped = [np.clip(e, -LIMIT, LIMIT).astype(np.float32) for e in training]
+        chunks = pieces_of(clipped, p, self.seed)
         random = torch.Generator().manual_seed(self.seed)
         state = torch.zeros(p.batch, p.units), torch.zeros(p.batch, v)
 
