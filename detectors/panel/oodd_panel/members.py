@@ -233,14 +233,22 @@ class Energy(_Mahalanobis):
         return features.energy
 
 
-class Pattern(PanelMember):
-    """Residual of the principal components of the latest rows (Q of Jackson & Mudholkar 1979)."""
-
-    name = "pattern"
+class _ByComponents(PanelMember):
+    """Principal components of the latest rows."""
 
     def features(self, features: Features) -> Floats:
         """Return the features that it looks at, (N, F)."""
         return features.window
+
+    def _prepare(self, components: Floats) -> None:
+        self.components_ = np.ascontiguousarray(components)
+        self._back = np.ascontiguousarray(components.T)
+
+
+class Pattern(_ByComponents):
+    """Residual of the principal components of the latest rows (Q of Jackson & Mudholkar 1979)."""
+
+    name = "pattern"
 
     def fit(self, features: Floats) -> None:
         """Learn from features of nominal rows, (N, F)."""
@@ -258,10 +266,6 @@ class Pattern(PanelMember):
         if n < f:
             components = few.T @ components / np.sqrt(np.maximum(values[:kept], 1e-12))
         self._prepare(components)
-
-    def _prepare(self, components: Floats) -> None:
-        self.components_ = np.ascontiguousarray(components)
-        self._back = np.ascontiguousarray(components.T)
 
     def differences(self, features: Floats) -> tuple[Floats, Floats]:
         """Return lengths (N,), and what each feature contributes to their squares, (N, F)."""
@@ -283,7 +287,7 @@ class Pattern(PanelMember):
         self._prepare(take(arrays, "components", (len(self.centre_), None)))
 
 
-class RecentRows(PanelMember):
+class RecentRows(_ByComponents):
     """Principal components of the latest rows: Hotelling's T² and Q together.
 
     Each counts in units of a quantile of rows that the components were not computed from, of the
@@ -291,10 +295,6 @@ class RecentRows(PanelMember):
     """
 
     name = "recent"
-
-    def features(self, features: Features) -> Floats:
-        """Return the features that it looks at, (N, F)."""
-        return features.window
 
     def fit(self, features: Floats) -> None:
         """Learn from features of nominal rows, (N, F)."""
@@ -314,10 +314,6 @@ class RecentRows(PanelMember):
         self.weights_ = 1.0 / (within * variances) - 1.0 / off
         self.unit_ = 1.0 / off
         self._prepare(components)
-
-    def _prepare(self, components: Floats) -> None:
-        self.components_ = np.ascontiguousarray(components)
-        self._back = np.ascontiguousarray(components.T)
 
     def _lengths(self, features: Floats) -> Floats:
         # In rows, however windows overlap: the bits of a sum depend on it.
