@@ -303,7 +303,7 @@ class Mahalanobis(_Scaled):
         self.root_ = take(arrays, "root", (sensors, None))
 
 
-class Manifold(_Scaled):
+class Manifold(Mahalanobis):
     r"""`Mahalanobis` of a row's sensors and all their products: surfaces that rows stay on.
 
     With z the standardized sensors and f those of z_i, z_i z_j that vary in training, standardized
@@ -314,14 +314,6 @@ class Manifold(_Scaled):
     """
 
     name = "manifold"
-
-    def score(self, trajectory: Trajectory) -> Scores:
-        """Return the score of every observation."""
-        self._scale().must_fit(trajectory)
-        return self._distances(trajectory.observations)
-
-    def _score(self, t: int, row: Row) -> float:  # noqa: ARG002
-        return float(self._distances(self._scale().checked(row)[None])[0])
 
     def _distances(self, rows: Row) -> Scores:
         import numpy as np
