@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from oodd_eval.arrays import as_numbers
 from oodd_eval.data.baseline import Baseline, check_baseline, episode_means
-from oodd_eval.data.facts import Quantity, roles_of
+from oodd_eval.data.facts import roles_of
 from oodd_eval.data.offsets import fit_offsets
 from oodd_eval.data.parts import CALIBRATION, TRAIN, TWINS, EnvironmentData, columns_named
 from oodd_eval.data.trajectory import Trajectory
@@ -158,8 +158,7 @@ class NominalData:
         parts = [[_trajectory(x, subtracted) for x in part] for part in raw]
         names = sensor_names(sensors, width)
         if columns:
-            named = [Quantity(name, "") for name in names]
-            numbers = [i for c in columns for i in columns_named(named, c, "the episodes")]
+            numbers = [i for c in columns for i in columns_named(names, c, "the episodes")]
             names, subtracted = [names[i] for i in numbers], subtracted[numbers]
             sensors = sensors and [sensors[i] for i in numbers]
             parts = [

@@ -253,15 +253,14 @@ def check_twins(
             )
 
 
-def columns_named(columns: Sequence[Quantity], name: str, environment: str) -> list[int]:
-    """Return the numbers of the columns of a name, or of NAME[0], NAME[1] and so on.
+def columns_named(names: Sequence[str], name: str, environment: str) -> list[int]:
+    """Return the numbers of the columns of a name, or of NAME[0], NAME[1] and so on, among names.
 
     Raises
     ------
     UnknownNameError
         When an environment has none.
     """
-    names = [column.name for column in columns]
     block = [i for i, text in enumerate(names) if re.fullmatch(re.escape(name) + r"\[\d+\]", text)]
     if name not in names and not block:
         check_known(f"column of {environment}", names, name)
@@ -347,7 +346,8 @@ class EnvironmentData:
         UnknownNameError
             When there is no such column.
         """
-        numbers = [i for name in names for i in columns_named(self.columns, name, self.id)]
+        stored = [column.name for column in self.columns]
+        numbers = [i for name in names for i in columns_named(stored, name, self.id)]
         view = copy.copy(self)
         view._show(numbers)  # noqa: SLF001  of this class
         return view

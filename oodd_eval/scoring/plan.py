@@ -17,7 +17,7 @@ from typing import Any, Final, Literal
 
 from oodd_eval.data import layout
 from oodd_eval.data.condition import Condition
-from oodd_eval.data.facts import PROTOCOL, Group, Quantity
+from oodd_eval.data.facts import PROTOCOL, Group
 from oodd_eval.data.parts import FAILURES, columns_named
 from oodd_eval.data.split import Split
 from oodd_eval.errors import UnknownNameError, UsageError
@@ -203,12 +203,12 @@ def _lacking(spec: DetectorSpec, split: Split, environment: str) -> str:
     if spec.training == "failures" and FAILURES not in entry["groups"]:
         advice = "import logs with an outcome and the share of failed ones, as in failures = 0.5"
         return f"{environment} has no failed episodes to learn from: {advice}"
-    columns, facts = [*map(Quantity.read, entry["sensors"])], layout.log_facts(entry)
+    columns, facts = [row["name"] for row in entry["sensors"]], layout.log_facts(entry)
     try:
         numbers = [i for name in spec.columns for i in columns_named(columns, name, environment)]
     except UnknownNameError as error:
         return str(error)
-    shifted = [columns[i].name for i in numbers if facts and facts.offsets and facts.offsets[i]]
+    shifted = [columns[i] for i in numbers if facts and facts.offsets and facts.offsets[i]]
     if shifted and spec.alarm in RECORDED:
         advice = "import the logs with it among scores, which are stored as they are"
         return f"{shifted[0]} of {environment} is stored less its mean: {advice}"
