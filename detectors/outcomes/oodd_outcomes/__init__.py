@@ -8,6 +8,9 @@ from typing import Any
 from oodd_eval import Detector, DetectorSpec, hookimpl
 from oodd_eval.plugins.parameters import checked, parameter
 
+Row = dict[str, bool]
+"""What a row is beside its parameters."""
+
 
 @dataclass(frozen=True, slots=True)
 class LogisticParameters:
@@ -24,14 +27,7 @@ class TdqcParameters:
 
 
 def make_outcome_detector(
-    name: str,
-    parameters: type,
-    *,
-    time: bool = False,
-    temporal: bool = False,
-    seed: int = 0,
-    horizon: int = 1,
-    **values: Any,
+    name: str, parameters: type, row: Row, *, seed: int = 0, horizon: int = 1, **values: Any
 ) -> Detector:
     """Return an unfitted detector of this package.
 
@@ -41,8 +37,8 @@ def make_outcome_detector(
         Name of the row, for messages.
     parameters
         The row's parameters, a dataclass.
-    time, temporal
-        See `oodd_outcomes.detector.OutcomeDetector`.
+    row
+        Whether there are `time` and `temporal`, see `oodd_outcomes.detector.OutcomeDetector`.
     seed, horizon
         From the harness, without effect.
     values
@@ -51,18 +47,17 @@ def make_outcome_detector(
     # Listing detectors needs no numpy.
     make = import_module(f"{__name__}.detector").OutcomeDetector
     settings: Any = checked(parameters, name, values)
-    detector: Detector = make(
-        name, ridge=settings.ridge, time=time, temporal=temporal, seed=seed, horizon=horizon
-    )
+    detector: Detector = make(name, ridge=settings.ridge, seed=seed, horizon=horizon, **row)
     return detector
 
 
 def _spec(
     *, name: str, parameters: type, summary: str, reference: str, **row: bool
 ) -> DetectorSpec:
+    kind: Row = {"time": False, "temporal": False}
     return DetectorSpec(
         name=name,
-        factory=partial(make_outcome_detector, name, parameters, **row),
+        factory=partial(make_outcome_detector, name, parameters, kind | row),
         parameters=parameters,
         summary=summary,
         reference=reference,
