@@ -17,6 +17,7 @@ from oodd_eval.names import read, whole_number
 from oodd_eval.plugins.contract import (
     AnyDetector,
     Detector,
+    DetectorSpec,
     StorableDetector,
     StreamingDetector,
     factory_of,
@@ -87,26 +88,24 @@ class DetectorHandle:
         if kind is None and statistic is not None:
             raise UsageError(f"{statistic=}, expected one of {', '.join(map(repr, STATISTICS))}")
         how: dict[str, Any] = {"seed": seed, "horizon": horizon, "parameters": parameters}
-        name, looks_at_actions, adapts, supervised = "", True, False, False
+        # A class or an instance declares nothing.
+        spec = DetectorSpec("", Detector, "", inputs="observations+actions")
         if isinstance(detector, str):
             plugins = discover()
             offer = plugins.offer(detector)
             if actions:
-                offer, parameters = plugins.taking_actions(offer, parameters)
+                offer, how["parameters"] = plugins.taking_actions(offer, parameters)
             offer.require()
-            how["parameters"] = parameters
             spec = offer.spec
-            adapts = spec.adapts == "baseline"
-            rows, declared = baseline if adapts else 0, roles if spec.roles else ()
+            rows, declared = baseline if spec.adapts else 0, roles if spec.roles else ()
             detector = make_detector(spec.factory, baseline=rows, roles=declared, **how)
-            kind, name = kind or spec.alarm, spec.name
-            looks_at_actions = spec.inputs != "observations"
-            supervised = spec.training == "failures"
         elif isinstance(detector, type) or not isinstance(detector, Detector):
             detector = make_detector(factory_of(detector), **how)
-        state = how | {"name": name, "statistic": kind or "cusum"}
-        state |= {"parameters": dict(parameters), "baseline": baseline, "roles": [*roles]}
-        return cls(detector, kind or "cusum", looks_at_actions, adapts, state, supervised)
+        alarm: AlarmKind = kind or spec.alarm
+        how["parameters"] = dict(how["parameters"])
+        state = {"name": spec.name, "statistic": alarm, "baseline": baseline, "roles": [*roles]}
+        learns = bool(spec.adapts), how | state, spec.training == "failures"
+        return cls(detector, alarm, spec.inputs != "observations", *learns)
 
     def fit(
         self,
