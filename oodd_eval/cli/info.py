@@ -1,7 +1,7 @@
 """``oodd-eval info``: describe a detector, an environment, an anomaly, a split or a metric."""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
 from typing import Any, Final
 
@@ -19,6 +19,7 @@ from oodd_eval.data.facts import (
     TABLE1,
     AnomalyInfo,
     EnvironmentInfo,
+    Quantity,
 )
 from oodd_eval.data.layout import log_facts
 from oodd_eval.data.registry import AnomalySpec, Spec
@@ -88,14 +89,14 @@ def _environment(info: EnvironmentInfo) -> Lines:
     yield "simulator", info.simulator
     yield "policy", f"{info.policy}, mean return {info.paper_return:g} in the paper"
     yield "longest episode", counted(info.episode_cap, "step(s)")
-    for i, sensor in enumerate(info.sensors):
-        yield (
-            "" if i else counted(info.observation_dim, "sensor(s)"),
-            f"{sensor.name} ({sensor.unit})",
-        )
-    kind = "discrete action(s)" if info.discrete else "action(s)"
-    for i, action in enumerate(info.actions):
-        yield "" if i else counted(info.action_dim, kind), f"{action.name} ({action.unit})"
+    yield from _columns("sensor(s)", info.sensors)
+    yield from _columns("discrete action(s)" if info.discrete else "action(s)", info.actions)
+
+
+def _columns(noun: str, columns: Sequence[Quantity]) -> Lines:
+    """Yield names with units, and before the first one how many there are."""
+    for i, column in enumerate(columns):
+        yield "" if i else counted(len(columns), noun), f"{column.name} ({column.unit})"
 
 
 def _custom(spec: Spec, origin: str) -> Lines:
@@ -108,9 +109,8 @@ def _custom(spec: Spec, origin: str) -> Lines:
         return
     yield "environment", f"{spec.name} ({spec.title or spec.name}), {origin}"
     yield "longest episode", counted(spec.episode_cap, "step(s)")
-    for kind, columns in (("sensor(s)", spec.sensors), ("action(s)", spec.actions)):
-        for i, column in enumerate(columns):
-            yield "" if i else counted(len(columns), kind), f"{column.name} ({column.unit})"
+    yield from _columns("sensor(s)", spec.sensors)
+    yield from _columns("action(s)", spec.actions)
     yield "attributes", ", ".join(spec.attributes) or "none"
 
 
@@ -122,14 +122,10 @@ def _imported(name: str, split: str, entry: Mapping[str, Any]) -> Lines:
             yield key, text
     for part, group in entry["groups"].items():
         yield part, counted(group["trajectories"], "episode(s)")
-    scores = [column for column in entry["sensors"] if column.get("role") == "score"]
-    sensors = [column for column in entry["sensors"] if column not in scores]
-    for kind, columns in (("sensor", sensors), ("score", scores), ("action", entry["actions"])):
-        for i, column in enumerate(columns):
-            yield (
-                "" if i else counted(len(columns), f"{kind}(s)"),
-                f"{column['name']} ({column['unit']})",
-            )
+    sensors, actions = ([*map(Quantity.read, entry[kind])] for kind in ("sensors", "actions"))
+    yield from _columns("sensor(s)", [column for column in sensors if column.role != "score"])
+    yield from _columns("score(s)", [column for column in sensors if column.role == "score"])
+    yield from _columns("action(s)", actions)
     yield "more", f"oodd-eval data info {split}"
 
 
