@@ -394,13 +394,11 @@ def _outcome(cell: UnpairedScores, statistic: GuaranteedAlarm, share: float) -> 
 
 
 def _brier(cell: UnpairedScores) -> Contribution:
-    m, n = cell.sizes
-    squares = np.full(m + n, np.nan)
+    distances, m = [*cell.nominal, *(1 - scores for scores in cell.anomalous)], len(cell.nominal)
+    squares = np.full(len(distances), np.nan)
     for nominal, failed, rows in _outcomes(cell):
-        for j in nominal:
-            squares[j] = mean_of(cell.nominal[j][:rows] ** 2).value
-        for i in failed:
-            squares[m + i] = mean_of((1 - cell.anomalous[i][:rows]) ** 2).value
+        for k in (*nominal, *(m + i for i in failed)):
+            squares[k] = mean_of(distances[k][:rows] ** 2).value
     return replace(mean_of(squares), nominal=m)
 
 
