@@ -104,6 +104,15 @@ def test_a_view_shows_the_columns_that_are_named_in_their_order(scored, parts, n
         assert again.digest == data.digest
 
 
+def test_a_column_of_a_name_comes_before_a_block_of_it(tmp_path, parts):
+    names = ["q0", "q0[0]", "q0[1]"]
+    columns = [*(replace(q, name=n) for q, n in zip(SENSORS, names, strict=True)), *SCORES]
+    split = load_split(write_columns_split(tmp_path / "s", parts, columns=columns))
+    with closing(split.environment("arm")) as data:
+        assert [q.name for q in data.of_columns(["q0"]).sensors] == ["q0"]
+    assert evaluate("column:q0", split)[0].ok
+
+
 def test_a_column_that_is_not_there_is_named_beside_the_nearest(scored):
     with closing(scored.environment("arm")) as data:
         with pytest.raises(

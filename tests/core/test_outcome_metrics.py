@@ -206,6 +206,15 @@ def test_two_tasks_by_hand():
     assert metrics["brier_outcome"].n == 5
 
 
+def test_with_a_rolling_calibration_each_nominal_episode_has_its_own_threshold():
+    nominal, failed = arrays([0, 1], [0, 2], [0, 3]), arrays([0, 5])
+    earlier = [GuaranteedAlarm(None, threshold) for threshold in (0.5, 2.5, 4.5)]
+    metrics = unpaired_alarms(cell(nominal, failed), GuaranteedAlarm(None, 4.5), None, earlier)
+    assert metrics["found_outcome"].value == 1.0
+    assert metrics["found_outcome_null"].value == pytest.approx(1 / 3)
+    assert metrics["balanced_outcome"].value == pytest.approx((1 + 2 / 3) / 2)
+
+
 def test_without_a_task_of_both_kinds_none_has_a_value():
     case = cell(arrays([0, 1]), arrays([1, 1]), nominal_tasks=["a"], tasks=["b"])
     metrics = computed(case, RULES[0], supervised=True)

@@ -178,8 +178,19 @@ def test_a_confirmed_gap_is_usual_from_then_on(tmp_path):
     assert "at most 1 of 42 by a gap of more than 2 rows" in watchdog.promise
     watchdog.save(tmp_path / "kept")
     for one in (watchdog, Watchdog.load(tmp_path / "kept")):
+        # A confirmed episode without a gap takes none of it back.
+        assert not any(r.alarm for r in fed(one, [0.5, 0.5]))
+        one.confirm()
         assert [r.alarm for r in fed(one, [0.5, None, None, None])] == [False, False, False, True]
-        assert one.calibration.largest[-1] == 60.0
+        assert one.calibration.largest[-2:] == (60.0, 0.5)
+
+
+def test_after_an_acknowledged_alarm_a_sum_is_held_as_long_again():
+    watchdog = Watchdog.of_scores(calibrate(HEALTHY, 0.1, alarm="cusum", hold=3))
+    high = 1e3 * watchdog.rule.threshold * watchdog.rule.standardization.std / 0.01
+    assert [watchdog.update(high).alarm for _ in range(3)] == [False, False, True]
+    watchdog.acknowledge()
+    assert [watchdog.update(high).alarm for _ in range(3)] == [False, False, True]
 
 
 def test_alarms_latch_are_acknowledged_and_held_off():

@@ -214,6 +214,27 @@ def test_an_export_has_the_failures_and_says_which_scores_it_lacks(tmp_path):
     assert [sensor["name"] for sensor in content["sensors"]] == ["number"]
 
 
+def test_unseen_tasks_are_taken_out_of_files_that_are_listed_for_training(tmp_path):
+    rollouts(tmp_path)
+    nominal = {"train": "task?-0*.csv", "calibration": "task?-1*.csv"}
+    found = parts(tmp_path, nominal=nominal, unseen=["1"])
+    odd = [*range(1, 20, 2)]
+    assert found["train"] == [(task, i) for task in "02" for i in odd if i < 10]
+    assert found["calibration"] == [(task, i) for task in "02" for i in odd if i > 10]
+    assert sorted(found["nominal"]) == [("1", i) for i in odd]
+
+
+def test_the_first_failed_episodes_are_those_with_the_first_stamps(tmp_path):
+    for i in range(20):  # the last file is the first recording
+        rows = [f"{1000 * (20 - i) + t},{i},{t % 5},0,{i % 2}" for t in range(9)]
+        text = "\n".join(["t,number,chunk_mse,task,success", *rows]) + "\n"
+        (tmp_path / f"r{i:02}.csv").write_text(text)
+    found = parts(tmp_path, failures=0.3, time="t[s]")
+    assert found["failures"] == [("0", i) for i in (18, 16, 14)]
+    assert {i for _, i in found["failure"]} == {*range(0, 13, 2)}
+    assert [i for _, i in found["train"]][:2] == [19, 17]
+
+
 @pytest.mark.parametrize(
     ("keys", "expected"),
     [

@@ -11,6 +11,7 @@ from helpers_logs import log_parts, write_log_split, write_table
 from mcap.writer import Writer
 
 from oodd_eval.cli.main import main
+from oodd_eval.data.facts import LogFacts
 
 ROWS = 30
 
@@ -321,6 +322,24 @@ def test_training_and_calibration_episodes_of_a_split_are_healthy(run, tmp_path)
     ) in text
     assert "field or column 'task'" in run("arm", "--score", "|q2|", "--per", "task", code=4)
     assert "keeps no field but the task" in run("arm", "--score", "|q2|", "--per", "frame", code=4)
+
+
+def test_baseline_rows_are_no_scores_and_what_a_split_subtracts_is_added_again(run, tmp_path):
+    parts = log_parts(train=9, calibration=10)
+    for episodes in parts.values():
+        for episode in episodes:
+            episode.observations[3] = 99.0  # in the baseline
+    facts = LogFacts(paired=False, baseline=10, offsets=(0.0, 0.0, 5000.0))
+    write_log_split(tmp_path / "arm", parts, facts)
+    healthy = [e.observations[10:, 2] for e in (*parts["train"], *parts["calibration"])]
+    threshold = 5000 + max(values.astype(np.float32).max() for values in healthy)
+    assert float(run("arm", "--score", "q2", "-q").split()[2]) == pytest.approx(threshold, rel=1e-5)
+    write_csv(tmp_path / "logs", range(20))
+    keys = "split = 's'\nsensors = ['residual']\nbaseline = 21\nnominal.files = '*.csv'\n"
+    (tmp_path / "arm.toml").write_text(keys)
+    largest = max(signal(i)[21:].max() for i in range(20))
+    text = run("logs", "--recipe", "arm.toml", "--score", "residual", "-q")
+    assert float(text.split()[2]) == pytest.approx(largest, abs=1e-3)
 
 
 def test_the_page_shows_what_is_printed(run, monkeypatch):
