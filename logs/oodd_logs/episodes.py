@@ -579,7 +579,7 @@ class _Reading:
         if (text := value(recipe.kinds)) is not None:
             nominal = map(text_of, recipe.nominal.where.get(recipe.kinds, ()))
             kind = "" if text in nominal else anomaly_name(text)
-        elif outcome is False:
+        if not kind and outcome is False:
             fallback = [name for name, table in recipe.anomalous.items() if not table.files]
             kind = next(iter([*recorded.kinds, *fallback]), FAILURE)
         return outcome, kind, value(recipe.task) or ""

@@ -181,17 +181,22 @@ def test_the_first_failed_episodes_of_each_task_are_for_training(tmp_path):
     assert "no failed episode is for training: failures = 0.01 of few" in notes
 
 
-def test_anomalous_episodes_that_succeeded_are_no_failures(tmp_path):
+def test_failed_episodes_are_anomalous_whatever_their_kind_and_others_are_no_failures(tmp_path):
     for i in range(24):
         rows = [
-            f"{i},{t % 5},0,{int(i % 4 > 0)},{'slip' if i % 2 == 0 else 'well'}" for t in range(9)
+            f"{i},{t % 5},0,{int(i % 4 > 0 and i != 11)},{'slip' if i % 2 == 0 else 'well'}"
+            for t in range(9)
         ]
         text = "\n".join(["number,chunk_mse,task,success,kind", *rows]) + "\n"
         (tmp_path / f"r{i:02}.csv").write_text(text)
     nominal = {"files": "*.csv", "where": {"kind": "well"}}
     found = parts(tmp_path, kinds="kind", nominal=nominal, failures=0.5)
-    assert [i for _, i in found["failures"]] == [0, 4, 8]
+    # Number 11 is well by its kind, and failed.
+    assert [i for _, i in found["failures"]] == [0, 4, 8, 11]
     assert [i for _, i in found["slip"]] == [2, 6, 10, 12, 14, 16, 18, 20, 22]
+    assert [i for p in ("train", "calibration", "nominal") for _, i in found[p]] == [
+        i for i in range(1, 24, 2) if i != 11
+    ]
 
 
 def test_unseen_tasks_are_in_the_test_alone(tmp_path):
