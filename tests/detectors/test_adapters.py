@@ -1,6 +1,7 @@
 """Classes of other libraries as detectors: direction, causality, horizons, names, errors."""
 
 import sys
+import threading
 
 import numpy as np
 import pytest
@@ -215,7 +216,7 @@ def test_a_detector_that_ranks_rows_among_each_other_gets_them_one_at_a_time():
 @pytest.mark.parametrize("name", ["pyod:AutoEncoder", "pyod:VAE"])
 def test_networks_of_pyod_are_quiet_repeatable_and_causal(name, capfd):
     nominal, (x,) = noise(60, 60), noise(20, seed=1)
-    before = torch.random.get_rng_state()
+    before, threads = torch.random.get_rng_state(), threading.active_count()
     settings = [{"seed": seed, "window": 1, "epoch_num": 2} for seed in (1, 1, 2)]
     first, again, other = (make(name, **s).fit(nominal).score(x) for s in settings)
     np.testing.assert_array_equal(first, again)
@@ -223,6 +224,7 @@ def test_networks_of_pyod_are_quiet_repeatable_and_causal(name, capfd):
     np.testing.assert_array_equal(first[:7], make(name, **settings[0]).fit(nominal).score(x[:7]))
     assert capfd.readouterr() == ("", "")
     assert torch.equal(before, torch.random.get_rng_state())
+    assert threading.active_count() == threads  # or every group of episodes is scored by a new fit
     assert not {"verbose", "device"} & parameters_of(offer(name).spec.parameters).keys()
 
 

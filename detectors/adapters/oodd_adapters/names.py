@@ -8,6 +8,7 @@ import io
 import json
 import math
 import re
+import sys
 from collections.abc import Callable, Mapping
 from contextlib import redirect_stdout
 from dataclasses import dataclass
@@ -42,6 +43,8 @@ def pyod_class(name: str) -> type:
         raise UsageError(f"'pyod:{name}' {reason}")
     with redirect_stdout(io.StringIO()):  # some print that torch is missing, and then raise
         module = importlib.import_module(f"pyod.models.{places[name]}")
+    if bars := sys.modules.get("tqdm"):
+        bars.tqdm.monitor_interval = 0  # its thread outlives a fit, which cannot be forked then
     outlier_class = getattr(module, name)
     return _class(outlier_class, f"pyod:{name}", "fit", "decision_function")
 
