@@ -15,7 +15,6 @@ from oodd_common.charts import Floats, product
 from torch import Tensor
 from torch.nn.functional import silu as torch_silu
 
-from oodd_eval import Trajectory
 from oodd_rivals.network_parameters import FlowParameters, TransitionFlowParameters
 from oodd_rivals.network_training import arrays_of, draw, minimize, ridge
 from oodd_rivals.networks import BLOCK, LIMIT, NetworkRival, Shapes, settings, silu
@@ -66,13 +65,8 @@ class FlowNorm(NetworkRival):
             parameters.conditional
         )
 
-    def score(self, trajectory: Trajectory) -> Floats:
-        """Return one score per observation."""
-        self._must_fit(trajectory)
-        scores = np.full(len(trajectory), np.nan)
-        columns = self._columns(self._standard(trajectory))
-        scores[self.lag :] = self._norms(*columns, trajectory.observations[self.lag :])
-        return scores
+    def _scores(self, rows: Floats, observations: NDArray[np.float32]) -> Floats:
+        return self._norms(*self._columns(rows), observations)
 
     def latents(self, context: Floats, rows: Floats) -> Floats:
         """Return where the flow carries rows, (N, C), given what it knows of each, (N, K)."""

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from oodd_common.charts import Floats, product
 from torch import Tensor
 
-from oodd_eval import Trajectory
 from oodd_rivals.network_parameters import MixtureParameters
 from oodd_rivals.network_training import arrays_of, draw, minimize
 from oodd_rivals.networks import BLOCK, LIMIT, NetworkRival, Shapes, settings
@@ -79,11 +78,8 @@ class DeepMixture(NetworkRival):
         super().__init__(name, seed=seed, horizon=horizon, actions=False, window=window, lag=0)
         self.parameters = parameters
 
-    def score(self, trajectory: Trajectory) -> Floats:
-        """Return one score per observation."""
-        self._must_fit(trajectory)
-        rows = self._standard_rows(trajectory.observations)
-        return self._energies(self._flat(rows), trajectory.observations)
+    def _scores(self, rows: Floats, observations: NDArray[np.float32]) -> Floats:
+        return self._energies(self._flat(rows), observations)
 
     def _judge(self, window: NDArray[np.float32], now: NDArray[np.float32], t: int) -> float:  # noqa: ARG002
         return float(self._energies(self._standard_rows(window).reshape(1, -1), now[None])[0])

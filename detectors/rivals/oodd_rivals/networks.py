@@ -86,6 +86,18 @@ class NetworkRival(StorableWindowDetector):
         self.reach = horizon
         """Transitions that an episode must have to be learned from."""
 
+    def score(self, trajectory: Trajectory) -> Floats:
+        """Return one score per observation, NaN for t < lag."""
+        self._must_fit(trajectory)
+        scores = np.full(len(trajectory), np.nan)
+        judged = trajectory.observations[self.lag :]
+        scores[self.lag :] = self._scores(self._standard(trajectory), judged)
+        return scores
+
+    @abstractmethod
+    def _scores(self, rows: Floats, observations: NDArray[np.float32]) -> Floats:
+        """Return scores from row `lag` on, from `_standard` rows and these rows as they are."""
+
     @abstractmethod
     def _train(self, training: Sequence[Floats], held_out: Sequence[Floats]) -> None:
         """Set `weights_` and `loss_`, from `_standard` rows of episodes."""

@@ -16,7 +16,6 @@ from oodd_torch.gru import Sequence as GruSequence
 from torch import Tensor
 from torch.nn.functional import silu as torch_silu
 
-from oodd_eval import Trajectory
 from oodd_rivals.network_parameters import RaptParameters
 from oodd_rivals.network_training import (
     arrays_of,
@@ -68,13 +67,8 @@ class RecurrentForecast(NetworkRival):
         super().__init__(name, seed=seed, horizon=horizon, actions=True)
         self.parameters = parameters
 
-    def score(self, trajectory: Trajectory) -> Floats:
-        """Return one score per observation, NaN for t < horizon."""
-        self._must_fit(trajectory)
-        scores = np.full(len(trajectory), np.nan)
-        residuals = self._residuals(self._standard(trajectory))
-        scores[self.horizon :] = self._statistic(residuals, trajectory.observations[self.horizon :])
-        return scores
+    def _scores(self, rows: Floats, observations: NDArray[np.float32]) -> Floats:
+        return self._statistic(self._residuals(rows), observations)
 
     def reset(self) -> None:
         """Begin a new live episode."""

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from oodd_common.charts import Floats, product, whitening
 from torch import Tensor
 
-from oodd_eval import Trajectory
 from oodd_rivals.network_parameters import LstmParameters
 from oodd_rivals.network_training import (
     arrays_of,
@@ -72,13 +71,8 @@ class StackedLstm(NetworkRival):
         self.parameters = parameters
         self.reach = horizon + parameters.steps - 1
 
-    def score(self, trajectory: Trajectory) -> Floats:
-        """Return one score per observation, NaN for t < horizon."""
-        self._must_fit(trajectory)
-        scores = np.full(len(trajectory), np.nan)
-        errors = self._errors(self._standard(trajectory))
-        scores[self.horizon :] = self._lengths(errors, trajectory.observations[self.horizon :])
-        return scores
+    def _scores(self, rows: Floats, observations: NDArray[np.float32]) -> Floats:
+        return self._lengths(self._errors(rows), observations)
 
     def reset(self) -> None:
         """Begin a new live episode."""

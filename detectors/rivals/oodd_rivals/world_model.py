@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from oodd_common.charts import Floats
 from torch import Tensor
 
-from oodd_eval import Trajectory
 from oodd_rivals.network_parameters import WorldModelParameters
 from oodd_rivals.network_training import arrays_of, draw, minimize, pieces_of, ridge, side_by_side
 from oodd_rivals.networks import LIMIT, SHRINK, NetworkRival, Shapes, gru_step, settings, silu
@@ -59,17 +58,12 @@ class WorldModel(NetworkRival):
         super().__init__(name, seed=seed, horizon=horizon, lag=1, actions=True)
         self.parameters = parameters
 
-    def score(self, trajectory: Trajectory) -> Floats:
-        """Return one score per observation, NaN for t < horizon."""
-        self._must_fit(trajectory)
-        episode, v = self._standard(trajectory), len(self.varying_)
-        moved = self._moved(trajectory.observations)
-        run = Run(self, episode[:1, :v])
-        scores = np.full(len(trajectory), np.nan)
-        for t in range(1, len(trajectory)):
-            value = run.step(episode[t - 1 : t, v:], episode[t : t + 1, :v])
-            scores[t] = self._statistic(value, moved[t])
-        return scores
+    def _scores(self, rows: Floats, observations: NDArray[np.float32]) -> Floats:
+        v = len(self.varying_)
+        run = Run(self, rows[:1, :v])
+        values = [run.step(rows[t - 1 : t, v:], rows[t : t + 1, :v]) for t in range(1, len(rows))]
+        pairs = zip(values, self._moved(observations), strict=True)
+        return np.array([self._statistic(*pair) for pair in pairs])
 
     def reset(self) -> None:
         """Begin a new live episode."""
