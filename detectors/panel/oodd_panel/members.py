@@ -244,6 +244,15 @@ class _ByComponents(PanelMember):
         self.components_ = np.ascontiguousarray(components)
         self._back = np.ascontiguousarray(components.T)
 
+    def arrays(self) -> Arrays:
+        """Return what `restore` takes."""
+        return {"centre": self.centre_, "components": self.components_}
+
+    def restore(self, arrays: Arrays) -> None:
+        """Take over a fit."""
+        self.centre_ = take(arrays, "centre", (None,))
+        self._prepare(take(arrays, "components", (len(self.centre_), None)))
+
 
 class Pattern(_ByComponents):
     """Residual of the principal components of the latest rows (Q of Jackson & Mudholkar 1979)."""
@@ -276,15 +285,6 @@ class Pattern(_ByComponents):
 
     def _lengths(self, features: Floats) -> Floats:
         return self.differences(features)[0]
-
-    def arrays(self) -> Arrays:
-        """Return what `restore` takes."""
-        return {"centre": self.centre_, "components": self.components_}
-
-    def restore(self, arrays: Arrays) -> None:
-        """Take over a fit."""
-        self.centre_ = take(arrays, "centre", (None,))
-        self._prepare(take(arrays, "components", (len(self.centre_), None)))
 
 
 class RecentRows(_ByComponents):
@@ -335,17 +335,11 @@ class RecentRows(_ByComponents):
 
     def arrays(self) -> Arrays:
         """Return what `restore` takes."""
-        return {
-            "centre": self.centre_,
-            "components": self.components_,
-            "weights": self.weights_,
-            "unit": np.array(self.unit_),
-        }
+        return {**super().arrays(), "weights": self.weights_, "unit": np.array(self.unit_)}
 
     def restore(self, arrays: Arrays) -> None:
         """Take over a fit."""
-        self.centre_ = take(arrays, "centre", (None,))
-        self._prepare(take(arrays, "components", (len(self.centre_), None)))
+        super().restore(arrays)
         self.weights_ = take(arrays, "weights", (self.components_.shape[1],))
         self.unit_ = float(take(arrays, "unit", (), "+"))
 
