@@ -415,9 +415,12 @@ def fit_detector(
 
     Failed episodes are handed to one that declares that it learns from them. Shares are heard in
     this process and during the fit only. `ContractError`: the detector calls what it is handed with
-    something else than a share.
+    something else than a share, or takes no failures.
     """
     further = {} if failures is None else {"failures": failures}
+    if further and not accepted(detector.fit, **further):
+        expected = "expected fit(nominal, failures=None)"
+        raise ContractError(f'it declares training="failures", and its fit takes none: {expected}')
     if progress is None or not takes_progress(detector):
         detector.fit(nominal, **further)
         return

@@ -585,8 +585,8 @@ def test_without_failures_a_detector_that_learns_from_them_is_left_out(failing, 
 
 def test_a_fit_that_takes_no_failures_is_an_error(failing, scored):
     (record,) = evaluate("refuses", scored)
-    assert record.status == "error"
-    assert "unexpected keyword argument 'failures'" in record.reason
+    assert record.status == "invalid"
+    assert "its fit takes none: expected fit(nominal, failures=None)" in record.reason
 
 
 class Counts:
