@@ -21,10 +21,9 @@ from oodd_logs.recording import Column, Recording, Topic
 
 _MARK: Final = b"\xa3\x95"
 _HEAD: Final = 3  # bytes: the mark, and the number of the message's kind
-_TYPES: Final = {
-    "b": "i1", "B": "u1", "c": "<i2", "C": "<u2", "d": "<f8", "e": "<i4",
-    "E": "<u4", "f": "<f4", "g": "<f2", "h": "<i2", "H": "<u2", "i": "<i4", "I": "<u4",
-    "L": "<i4", "M": "u1", "n": "S4", "N": "S16", "q": "<i8", "Q": "<u8", "Z": "S64",
+_TYPES: Final = {letter: f"<{letter}" for letter in "bBdfhHiIqQ"} | {
+    "c": "<i2", "C": "<u2", "e": "<i4", "E": "<u4", "g": "<f2", "L": "<i4", "M": "u1",
+    "n": "S4", "N": "S16", "Z": "S64",
 }  # fmt: skip
 _SCALES: Final = {"c": 100.0, "C": 100.0, "e": 100.0, "E": 100.0, "L": 1e7}
 _STAMPS: Final = {"TimeUS": 1e6, "TimeMS": 1e3}
