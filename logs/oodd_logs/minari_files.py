@@ -77,9 +77,8 @@ def export(
     try:
         for environment in environments:
             with contextlib.closing(split.environment(environment)) as data:
-                parts = data.train, *parts_of(data, data.anomalies).values()
-                parts += (data.failures,) if data.failures else ()
-                for trajectories in (part for part in parts if len(part)):
+                parts = data.train, *parts_of(data, data.anomalies).values(), data.failures
+                for trajectories in filter(None, parts):
                     identity = f"{NAMESPACE}/{name}/{environment}/{_dataset(trajectories.group)}"
                     _write(directory, identity, data, trajectories, split)
                     written.append(identity)
