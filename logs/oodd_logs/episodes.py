@@ -769,9 +769,8 @@ class _Reading:
         for task in {facts.episode.task for facts in failed}:
             of_task = [facts for facts in failed if facts.episode.task == task]
             taken |= {*of_task[: int(np.rint(self.recipe.failures * len(of_task)))]}
-        for part, episodes in self.parts.items():
-            self.parts[part] = [facts for facts in episodes if facts not in taken]
-        self.parts = {part: episodes for part, episodes in self.parts.items() if episodes}
+        left = {part: [f for f in facts if f not in taken] for part, facts in self.parts.items()}
+        self.parts = {part: facts for part, facts in left.items() if facts}
         return [facts for facts in failed if facts in taken]
 
     def _source(self, parts: dict[str, list[EpisodeFacts]]) -> EpisodeSource:
@@ -841,9 +840,8 @@ class _Reading:
             how = f"shuffled (seed {recipe.seed})" if recipe.order == "shuffled" else how
             lines.append(f"nominal episodes were shared out {how}")
         if recipe.failures and FAILURES not in source.parts:
-            lines.append(
-                f"no failed episode is for training: failures = {recipe.failures:g} of few"
-            )
+            share = f"failures = {recipe.failures:g} of few"
+            lines.append(f"no failed episode is for training: {share}")
         if self.steps and source.rate is None:
             steps = self._all_steps()
             shortest, longest = min(s.shortest for s in steps), max(s.longest for s in steps)
