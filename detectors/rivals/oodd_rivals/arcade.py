@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from oodd_common.charts import Floats
 from oodd_common.windows import StandardEpisode, regressors
 
-from oodd_eval import Trajectory
 from oodd_eval.errors import TrajectoryError
 from oodd_rivals.networks import NetworkRival, Shapes, Weights, settings
 from oodd_rivals.parameters import ArcadeParameters
@@ -90,15 +89,10 @@ class Arcade(NetworkRival):
         self.parameters = parameters
         self.seed = 0  # of the order of episodes, and so of the folds
 
-    def score(self, trajectory: Trajectory) -> Floats:
-        """Return one score per observation, NaN for t < horizon."""
-        self._must_fit(trajectory)
-        scores, heads = np.full(len(trajectory), np.nan), self._new_heads(self.weights_)
-        inputs, rows = self._pairs(self._standard(trajectory))
-        moved = self._moved(trajectory.observations)[self.horizon :]
-        for t, row in enumerate(zip(inputs, rows, moved, strict=True), self.horizon):
-            scores[t] = self._judged(heads, *row)
-        return scores
+    def _scores(self, rows: Floats, observations: NDArray[np.float32]) -> Floats:
+        heads, pairs = self._new_heads(self.weights_), self._pairs(rows)
+        judged = zip(*pairs, self._moved(observations), strict=True)
+        return np.array([self._judged(heads, *row) for row in judged])
 
     def reset(self) -> None:
         """Begin a new live episode."""
