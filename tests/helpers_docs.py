@@ -72,6 +72,8 @@ PARSED_ONLY = [
     Rule(r"^oodd-eval data (inspect|import) (g1|bags|mug)\b",
          "needs a data set of LeRobot, or a bag; tests of the readers write both"),
     Rule(r"^oodd-eval data import cube\.toml$", "needs trials; test_inspect_robots records them"),
+    Rule(r"^oodd-eval (data import rollouts\.toml|run --split rollouts)\b",
+         "needs rollouts; test_rollouts makes some"),
     Rule(r"^oodd-eval data import plant --env pump ", "test_import imports such parts"),
     Rule(r"^oodd-eval .*\b(go1|walks)\b", "needs a robot that others published"),
     Rule(r"--executor dask://", "needs a cluster; test_executors starts one"),

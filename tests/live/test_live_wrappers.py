@@ -339,5 +339,5 @@ def test_the_snippet_of_the_readme_prints_what_it_says():
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed):
         exec(compile(snippet, "README.md", "exec"), {})  # noqa: S102
-    said = re.search(r"print\(info\[\"oodd\"\]\)  # (row \d+: alarm, [a-z ]+) \d+%", snippet)[1]
+    said = re.search(r"print\(info\[\"oodd\"\]\)  # (row \d+: alarm, [a-z ,]+) \d+%", snippet)[1]
     assert printed.getvalue().startswith(said)
