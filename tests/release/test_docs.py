@@ -161,7 +161,7 @@ def test_reference_has_every_public_name(site):
 
     text = "".join(p.read_text() for p in (site / "reference").glob("*.html"))
     names = {*oodd_eval.__all__} - {"__version__", "hookimpl", "live"}
-    missing = {n for n in names if not re.search(rf'id="oodd_(eval|checks|logs)\.[\w.]*{n}"', text)}
+    missing = {n for n in names if not re.search(rf'id="oodd_\w+\.[\w.]*{n}"', text)}
     assert not missing
     for hook in ("detectors", "detector_from_spec"):
         assert f'id="oodd_eval.plugins.oodd_{hook}"' in text
@@ -195,7 +195,8 @@ def test_figures_are_what_the_script_draws(drawn):
     if importlib.metadata.version("matplotlib") != pinned[1]:
         pytest.skip("another matplotlib draws the same figure in another way")
     names = {path.name for path in drawn.iterdir()}
-    assert names == {path.name for path in FIGURES.glob("*.svg")}
+    # interventions.py draws the other one, from cells that are not committed.
+    assert names == {path.name for path in FIGURES.glob("*.svg")} - {"intervention.svg"}
     for name in sorted(names):
         new, old = (Path(d, name).read_text() for d in (drawn, FIGURES))
         # Processors differ in last digits of scores: ids, which are digests, and fractions of
@@ -209,7 +210,8 @@ def test_figures_are_what_the_script_draws(drawn):
 def test_figures_of_the_protocol_are_all_shown_and_described():
     shown = re.findall(r"!\[([^\]]+)\]\(figures/(\w+)\.svg\)", (DOCS / "protocol.md").read_text())
     drawn = {path.stem for path in FIGURES.glob("*.svg")}
-    assert {figure for _, figure in shown} == drawn - {"power", "shutdown"}
+    assert {figure for _, figure in shown} == drawn - {"intervention", "power", "shutdown"}
+    assert "(figures/intervention.svg)" in (DOCS / "interventions.md").read_text()
     assert "(figures/shutdown.svg)" in (DOCS / "index.md").read_text()
     assert "(docs/figures/power.svg)" in (ROOT / "README.md").read_text()
     assert all(len(described) > 30 for described, _ in shown)
