@@ -23,7 +23,18 @@ from oodd_eval import errors
 ROOT = Path(__file__).parents[2]
 SEARCH = [
     ROOT,
-    *(ROOT / name for name in ("checks", "leaderboard", "live", "logs", "monitors", "recording")),
+    *(
+        ROOT / name
+        for name in (
+            "checks",
+            "interventions",
+            "leaderboard",
+            "live",
+            "logs",
+            "monitors",
+            "recording",
+        )
+    ),
     *(ROOT / "detectors").iterdir(),
 ]
 OPTIONAL = {"oodd_eval.scoring.executors.dask", "oodd_eval.__main__"}
