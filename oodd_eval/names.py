@@ -16,7 +16,7 @@ Read = TypeVar("Read")
 
 DETECTOR_NAME: Final = r"[a-z0-9][a-z0-9-]{0,63}"
 COLUMN_NAME: Final = r"[\w/][-+\w ./%()\[\]]{0,119}"
-"""What a column of logs is called where it is named as a detector, without its sign."""
+"""The name of a column of logs as a detector has it, without its sign."""
 
 SPEC_NAME: Final = DETECTOR_NAME + r"(:[-\w/][-+\w ./%()\[\]]{0,127})?"
 """A detector's name, perhaps with a class or column behind a colon: it goes into tables."""

@@ -41,8 +41,8 @@ _KEPT: Final = 1 << 24  # bytes up to which a part is decompressed once and kept
 
 def conditions_in(groups: Iterable[str]) -> tuple[Condition, ...]:
     """Return the conditions among groups such as ``"test/iid"``, in the benchmark's order."""
-    others = (*NOMINAL, FAILURES, NAMES)
-    tests = sorted(group.removeprefix("test/") for group in groups if group not in others)
+    untested = (*NOMINAL, FAILURES, NAMES)
+    tests = sorted(group.removeprefix("test/") for group in groups if group not in untested)
     return tuple(in_suite_order(map(Condition.parse, tests)))
 
 

@@ -9,7 +9,7 @@ from oodd_eval import Detector, DetectorSpec, hookimpl
 from oodd_eval.plugins.parameters import checked, parameter
 
 Row = dict[str, bool]
-"""What a row is beside its parameters."""
+"""Settings of a row that no parameter changes."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -43,7 +43,7 @@ LEAST: Final = 1e-9
 """Least length and share that is divided by."""
 
 FEATURES: Final = 2
-"""What is known of a reconstruction: its relative distance and its cosine."""
+"""Features of a reconstruction: its relative distance and its cosine."""
 
 
 class DeepMixture(NetworkRival):

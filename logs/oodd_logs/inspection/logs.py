@@ -665,8 +665,8 @@ def recognised(path: Path, form: str) -> tuple[Reader, list[Path], Counter[str]]
             "--format, or a recipe, says which it is"
         )
     # Beside logs, JSON files hold settings, and .bin anything.
-    others = {"json", "ardupilot"}
-    name = max(by_reader, key=lambda reader: (reader not in others, len(by_reader[reader])))
+    ambiguous = {"json", "ardupilot"}
+    name = max(by_reader, key=lambda reader: (reader not in ambiguous, len(by_reader[reader])))
     read = {*by_reader[name]}
     return formats[name], by_reader[name], Counter(f.suffix for f in files if f not in read)
 
