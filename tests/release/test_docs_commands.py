@@ -82,25 +82,6 @@ KNOWN = {
             r"--detector panel,mahalanobis,range,clock": "--detector panel --param forecast=linear"
         },
     },
-    "docs/index.md": {
-        "files": {
-            "make_logs.py": """
-                from pathlib import Path
-
-                import numpy as np
-
-                rng = np.random.default_rng(0)
-                Path("logs").mkdir()
-                for name in [f"run-{i}" for i in range(40)] + [f"slip-{i}" for i in range(4)]:
-                    fault = (np.arange(100) > 50) * name.startswith("slip")
-                    rows = rng.normal(size=(100, 2)) + 4 * fault[:, None]
-                    lines = [f"{a},{b},{c}" for (a, b), c in zip(rows, fault, strict=True)]
-                    text = "\\n".join(["speed,torque,fault", *lines])
-                    Path("logs", f"{name}.csv").write_text(text)
-            """
-        },
-        "before": ["python -m make_logs"],
-    },
     "docs/data.md": {
         "rules": {
             r"data build worlds$": "data build worlds --env tank",

@@ -106,7 +106,9 @@ def test_metadata_say_what_the_project_says(distributions):
     labels = metadata.get_all("Classifier")
     assert not {*labels} - classifiers
     assert {*labels}.isdisjoint(deprecated_classifiers)
-    columns = re.search(r"\| extra \| for \| Python (.*) \|", (ROOT / "docs/index.md").read_text())
+    columns = re.search(
+        r"\| extra \| for \| Python (.*) \|", (ROOT / "docs/how-to/install.md").read_text()
+    )
     minors = [label.rpartition(" ")[2] for label in labels if ":: Python :: 3." in label]
     assert minors == columns[1].split(" | ")
 

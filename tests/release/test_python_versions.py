@@ -1,7 +1,7 @@
 """What needs no PyBullet installs and runs under newer Pythons, with the same results.
 
 Under the newest other Python of this machine; with ``--long`` under all of them, every extra in an
-environment of its own. The table of docs/index.md says what is expected.
+environment of its own. The table of docs/how-to/install.md says what is expected.
 """
 
 import email
@@ -43,7 +43,7 @@ NEWEST = next(filter(interpreter, NEWER), None)
 
 def table():
     """Return the versions of the table's columns, and its cells by extra; "" is no extra."""
-    lines = re.findall(r"^\| .*\|$", (ROOT / "docs" / "index.md").read_text(), re.MULTILINE)
+    lines = re.findall(r"^\| .*\|$", (ROOT / "docs/how-to/install.md").read_text(), re.MULTILINE)
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     (begin,) = (i for i, row in enumerate(rows) if row[0] == "extra")
     names = [row[0].strip("`") for row in rows[begin + 1 :]]

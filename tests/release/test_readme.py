@@ -52,7 +52,9 @@ def test_commands_in_documents_parse(path, capsys):
 def test_commands_without_installing_run_the_wheel_of_this_version():
     from oodd_eval import __version__
 
-    lines = re.findall(r"^(?:uvx|pipx) .*$", (ROOT / "docs" / "index.md").read_text(), re.MULTILINE)
+    lines = re.findall(
+        r"^(?:uvx|pipx) .*$", (ROOT / "docs/how-to/install.md").read_text(), re.MULTILINE
+    )
     assert len(lines) == 4
     for line in lines:
         words = shlex.split(line)
@@ -85,4 +87,6 @@ def test_citations_have_the_version():
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == __version__
     cite = (ROOT / "docs" / "cite.md").read_text()
     assert f"version = {{{__version__}}}" in cite
-    assert f"oodd_eval-{__version__}-py3-none-any.whl" in (ROOT / "docs" / "index.md").read_text()
+    assert (
+        f"oodd_eval-{__version__}-py3-none-any.whl" in (ROOT / "docs/how-to/install.md").read_text()
+    )
