@@ -13,17 +13,31 @@ from typing import Final
 from oodd_eval._version import repository
 from oodd_eval.errors import OutputError, UsageError
 
+_SHARED: Final = {".gitignore": "gitignore.in", "src/@MODULE@/py.typed": "py.typed.in"}
+
 FILES: Final = {
     "pyproject.toml": "pyproject.toml.in",
     "README.md": "readme.md.in",
-    ".gitignore": "gitignore.in",
     ".github/workflows/ci.yml": "ci.yml.in",
     "src/@MODULE@/__init__.py": "plugin.py.in",
     "src/@MODULE@/detector.py": "detector.py.in",
-    "src/@MODULE@/py.typed": "py.typed.in",
     "tests/test_detector.py": "test.py.in",
+    **_SHARED,
 }
 """Path in the project and template, in the order in which they are told."""
+
+ENVIRONMENT_FILES: Final = {
+    "pyproject.toml": "environment/pyproject.toml.in",
+    "README.md": "environment/readme.md.in",
+    ".github/workflows/ci.yml": "environment/ci.yml.in",
+    "src/@MODULE@/__init__.py": "environment/plugin.py.in",
+    "src/@MODULE@/simulation.py": "environment/simulation.py.in",
+    "src/@MODULE@/policy.py": "environment/policy.py.in",
+    "src/@MODULE@/anomalies.py": "environment/anomalies.py.in",
+    "tests/test_environment.py": "environment/test.py.in",
+    **_SHARED,
+}
+"""The same of a project with an environment."""
 
 LONGEST: Final = 30  # so that lines of the templates stay within their limit
 _RESERVED: Final = ("all", "eval")  # every detector, and this distribution
@@ -44,9 +58,10 @@ the CI workflow install it. Where oodd-eval is installed already, leave the firs
 
 @dataclass(frozen=True, slots=True)
 class Project:
-    """The names of a plug-in project, which follow from the name of its detector."""
+    """The names of a plug-in project, which follow from that of its detector or environment."""
 
     name: str
+    environment: bool = False
 
     def __post_init__(self) -> None:
         if self.name in _RESERVED:
@@ -55,7 +70,7 @@ class Project:
             close = _tidy(self.name)
             hint = f"; did you mean {close!r}?" if _is_name(close) else ""
             raise UsageError(
-                f"{self.name!r} is no name for a detector: expected lower-case letters, digits and "
+                f"{self.name!r} is no name for a project: expected lower-case letters, digits and "
                 f"single hyphens, beginning with a letter, without 'oodd-', at most {LONGEST} "
                 f"characters{hint}"
             )
@@ -104,7 +119,7 @@ class Project:
 
         return {
             fill(path): fill((templates / template).read_text(encoding="utf-8"))
-            for path, template in FILES.items()
+            for path, template in (ENVIRONMENT_FILES if self.environment else FILES).items()
         }
 
 
