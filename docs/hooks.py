@@ -24,6 +24,7 @@ from properdocs.structure.nav import Navigation
 from properdocs.structure.pages import Page
 
 from oodd_eval._version import repository
+from oodd_eval.cli import ALL
 from oodd_eval.cli.main import PROGRAM
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -227,5 +228,7 @@ def _commands() -> str:
                 add(click.Context(group.get_command(context, name), context, info_name=name))
 
     # Narrow enough for a page, whatever the terminal is.
-    add(click.Context(PROGRAM, info_name="oodd-eval", terminal_width=80))
+    program = click.Context(PROGRAM, info_name="oodd-eval", terminal_width=80)
+    program.meta[ALL] = True
+    add(program)
     return "\n\n".join(sections)

@@ -34,6 +34,7 @@ _PERCENT.name = "PERCENT"
 @command(
     "intervene --detector mewma-a --env cartpole",
     "intervene --detector panel-a,riqn --env all --act mask --jobs 2",
+    further={"Other": "--base --param"},
 )
 @click.option("--detector", required=True, type=Names("detectors"), help=NAMES)
 @click.option("--env", required=True, type=Names("envs"), help=NAMES)

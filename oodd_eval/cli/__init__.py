@@ -9,7 +9,7 @@ from importlib import import_module
 from inspect import getdoc
 from itertools import chain
 from pathlib import Path
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 from typing import Any, Final, TypeAlias
 
 import click
@@ -57,6 +57,8 @@ class Command(click.Command):
         Arguments of oodd-eval that the help shows.
     repeated
         Options that may have several words behind them, each of which is a value.
+    further
+        Options that ``--help`` leaves out, by the headings that ``--help-all`` has them under.
     """
 
     def __init__(
@@ -65,10 +67,18 @@ class Command(click.Command):
         params: list[click.Parameter],
         examples: Sequence[str],
         repeated: Sequence[str],
+        further: Mapping[str, str],
     ) -> None:
         settings = {"show_default": True}
+        self.further = {name: head for head, names in further.items() for name in names.split()}
+        self._help_all = [_help_all(len(self.further))] if further else []
         super().__init__(None, settings, params=params, help=getdoc(handler))
         self.handler, self.examples, self._repeated = handler, examples, repeated
+
+    def get_params(self, ctx: click.Context) -> list[click.Parameter]:
+        """Return options and arguments, with those that print a help text."""
+        *params, help_option = super().get_params(ctx)
+        return [*params, *self._help_all, help_option]
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Read the arguments, with ``--records a b`` as ``--records=a --records=b``."""
@@ -104,10 +114,49 @@ class Command(click.Command):
             if path in (taken for _, taken in outputs[:i]):
                 raise UsageError(f"two outputs are {str(path)!r}: {option} would replace the first")
 
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write arguments and options; the further ones where the context asks for all."""
+        shown: dict[str, list[tuple[str, str]]] = {"Positional arguments": [], "Options": []}
+        shown |= {heading: [] for heading in self.further.values()}
+        for item in self.get_params(ctx):
+            heading = self.further.get(item.opts[0], "Options")
+            if isinstance(item, click.Argument):
+                heading = "Positional arguments"
+            if record := item.get_help_record(ctx):
+                shown[heading].append(record)
+        for heading, records in shown.items():
+            if records and (ctx.meta.get(ALL) or heading not in self.further.values()):
+                with formatter.section(heading):
+                    formatter.write_dl(records)
+
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the examples."""
         del ctx
         write_section(formatter, "Examples", [f"oodd-eval {line}" for line in self.examples])
+
+
+ALL: Final = "oodd_eval.all"
+"""Key of `click.Context.meta`: whether a help text has all options."""
+
+
+def _help_all(left_out: int) -> click.Option:
+    """Return the option ``--help-all`` of a command whose ``--help`` leaves some options out."""
+
+    def show(ctx: click.Context, _option: click.Parameter, asked: bool) -> None:
+        if asked and not ctx.resilient_parsing:
+            ctx.meta[ALL] = True
+            click.echo(ctx.get_help())
+            ctx.exit()
+
+    return click.Option(
+        ["--help-all"],
+        is_flag=True,
+        is_eager=True,
+        expose_value=False,
+        callback=show,
+        show_default=False,
+        help=f"Show {left_out} more options and exit.",
+    )
 
 
 def write_section(formatter: click.HelpFormatter, heading: str, lines: Iterable[str]) -> None:
@@ -121,13 +170,14 @@ def command(
     *examples: str,
     plugins: bool = False,
     repeated: Sequence[str] = (),
+    further: Mapping[str, str] = MappingProxyType({}),
     kind: type[Command] = Command,
 ) -> Callable[[Handler], Command]:
     """Return a decorator that makes a command of a function with click's options.
 
     Parameters
     ----------
-    examples, repeated
+    examples, repeated, further
         As in `Command`.
     plugins
         Whether the command loads plug-ins, and so has the option ``-p``.
@@ -138,7 +188,7 @@ def command(
     def decorate(handler: Handler) -> Command:
         params = [*reversed(getattr(handler, "__click_params__", []))]
         options = _PLUGIN_OPTION if plugins else ()
-        return kind(handler, [*params, *options, *_VERBOSITY], examples, repeated)
+        return kind(handler, [*params, *options, *_VERBOSITY], examples, repeated, further)
 
     return decorate
 
@@ -164,6 +214,10 @@ class Group(click.Group):
         super().__init__(help=help_text, no_args_is_help=False, subcommand_metavar="COMMAND ...")
         self.sections = sections
         self.entries = {name: row for rows in sections.values() for name, row in rows.items()}
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Read the arguments; without any, print the help, as git, docker and gh do."""
+        return super().parse_args(ctx, args or ["--help"])
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the names of the commands."""

@@ -26,6 +26,7 @@ T = TypeVar("T")
 Rows = Iterable[tuple[str, ...]]
 
 KINDS: Final = ("detectors", "envs", "anomalies", "splits", "metrics")
+_SYNONYMS: Final = {"environments": "envs", "kinds": "anomalies"}
 
 
 @command("list detectors", "list metrics", plugins=True)
@@ -35,12 +36,13 @@ def list_names(options: Options) -> int:
 
     The exit code is 1 when a plug-in is broken.
     """
-    check_known("thing to list", KINDS, options.kind)
+    kind = _SYNONYMS.get(options.kind, options.kind)
+    check_known("thing to list", (*KINDS, *_SYNONYMS), kind)
     plugins = discover(options.disabled)
-    if options.kind == "detectors":
+    if kind == "detectors":
         say_notes(plugins.notes)
-    print(tabulate(rows(options.kind, plugins), tablefmt="plain", disable_numparse=True))
-    return int(options.kind == "detectors" and bool(plugins.broken))
+    print(tabulate(rows(kind, plugins), tablefmt="plain", disable_numparse=True))
+    return int(kind == "detectors" and bool(plugins.broken))
 
 
 def rows(kind: str, plugins: Plugins) -> Rows:

@@ -21,10 +21,11 @@ from oodd_eval.errors import OoddError
 
 FIRST_STEPS: Final = (
     "run --detector mewma --env hopper  evaluate a detector, in seconds",
-    "show oodd-results                  print tables of that run again",
     "list detectors                     list what else can be run",
     "leaderboard show                   print the board",
-    "data inspect LOGS                  look at logs of your own system",
+    "scan LOGS                          find odd episodes in your logs",
+    "calibrate LOGS --score COLUMN      find your monitor's threshold",
+    "new NAME                           write a detector of your own",
 )
 
 EXIT_CODES: Final = (
@@ -75,14 +76,9 @@ POLICIES: Final[Commands] = {
 }
 
 COMMANDS: Final[Mapping[str, Commands]] = {
-    "Evaluate": {
+    "Evaluate detectors": {
         "run": ("fit and score every selected cell", "oodd_eval.cli.run:run"),
         "show": ("print the tables of earlier results", "oodd_eval.cli.show:show"),
-        "scan": ("find odd episodes in recorded logs", "oodd_logs.commands.scan_logs:scan"),
-        "calibrate": (
-            "find the threshold of a recorded score",
-            "oodd_monitors.commands.calibrate_score:calibrate_score",
-        ),
         "compare": ("compare rows, or results with a reference", "oodd_eval.cli.compare:compare"),
         "forget": ("remove cells from a results directory", "oodd_eval.cli.forget:forget"),
         "intervene": (
@@ -90,6 +86,14 @@ COMMANDS: Final[Mapping[str, Commands]] = {
             "oodd_interventions.commands:intervene",
         ),
         "reproduce": ("compute the paper's tables and claims", "oodd_paper.command:reproduce"),
+    },
+    "Use logs of your own": {
+        "scan": ("find odd episodes in recorded logs", "oodd_logs.commands.scan_logs:scan"),
+        "calibrate": (
+            "find the threshold of a recorded score",
+            "oodd_monitors.commands.calibrate_score:calibrate_score",
+        ),
+        "data": ("inspect and import logs, record and fetch splits", DATA),
     },
     "Look up": {
         "list": ("list what there is, one line each", "oodd_eval.cli.listing:list_names"),
@@ -99,7 +103,6 @@ COMMANDS: Final[Mapping[str, Commands]] = {
     "Add your own": {
         "new": ("write a ready plug-in project", "oodd_checks.commands.new:new"),
         "check": ("check that a detector honours the contract", "oodd_checks.commands.check:check"),
-        "data": ("import, record, verify, fetch and export splits", DATA),
         "policies": ("train and evaluate nominal policies", POLICIES),
         "completion": ("print a script for a shell's completion", "oodd_eval.cli.main:completion"),
     },
@@ -194,7 +197,7 @@ def _exit_code(arguments: list[str]) -> int:
     invocation = shlex.join(["oodd-eval", *arguments])
     try:
         # Group.main is not called, as it has exit codes of its own.
-        with PROGRAM.make_context("oodd-eval", arguments or ["--help"], obj=invocation) as context:
+        with PROGRAM.make_context("oodd-eval", arguments, obj=invocation) as context:
             code: int = PROGRAM.invoke(context)
         sys.stdout.flush()
     except click.exceptions.Exit as ended:  # --help and --version

@@ -72,6 +72,11 @@ class _Configurable(Command):
     "run --detector rf --env all",
     "run --detector pe,rf --env hopper,ant --anomaly iid,gravity --jobs 2",
     "run --detector riqn --env hopper --param updates=500 --horizon 1,10 --output mine",
+    further={
+        "What runs": "--horizon --limit --rolling --collect-only -x --config -p",
+        "Where, and within which limits": "--device --timeout --memory --executor --sandbox",
+        "Tables": "--intervals --level --paper --row-metrics",
+    },
     plugins=True,
     kind=_Configurable,
 )

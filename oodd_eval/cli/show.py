@@ -50,6 +50,10 @@ _format_options: Final = together(
     "show oodd-results --detector rf --metric missed_at_5pct",
     "show oodd-results --env hopper -k 'not drift' --csv",
     "show oodd-results --alarm score",
+    further={
+        "Which results": "--split --stored",
+        "Tables and formats": "--row-metrics --paper --alarm --json --latex",
+    },
 )
 @click.argument("directory", type=DIRECTORY, help="results directory")
 @click.option("--split", type=Name("splits"), help="where the split is, if not at its usual place")

@@ -43,7 +43,14 @@ _OF_RUNS: Final = (
 
 
 @command(
-    "reproduce --tier mini", "reproduce --tier reduced --plan", plugins=True, repeated=["--records"]
+    "reproduce --tier mini",
+    "reproduce --tier reduced --plan",
+    plugins=True,
+    repeated=["--records"],
+    further={
+        "Where, and within which limits": "--device --timeout --memory -p",
+        "Pages": "--records --beside --no-figures",
+    },
 )
 @click.option(
     "--tier",

@@ -70,6 +70,7 @@ def _strengths(text: str) -> list[tuple[str, float]]:
     "--strength iid=0.1,0.3",
     "data build other --env cartpole --policy cartpole.npz --train 40 --calibration 40 --test 10 "
     "--seed-base 43",
+    further={"Other": "--noise --suite --policy -p"},
     plugins=True,
 )
 @click.argument(

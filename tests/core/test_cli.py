@@ -11,13 +11,14 @@ import sys
 import time
 from pathlib import Path
 
+import click
 import pytest
 from click.shell_completion import ShellComplete
 from helpers_plugins import install
 from helpers_split import make_split
 from rich.console import Console
 
-from oodd_eval.cli import listing
+from oodd_eval.cli import ALL, Group, listing
 from oodd_eval.cli import main as cli
 from oodd_eval.cli import run as run_module
 from oodd_eval.errors import UnknownNameError
@@ -289,7 +290,9 @@ def test_options_come_from_a_file_and_the_command_line_wins(run, tmp_path, faili
     ("arguments", "message"),
     [
         (["list", "detector"], "unknown thing to list 'detector': did you mean 'detectors'?"),
-        (["data"], "(see oodd-eval data --help)"),
+        (["list", "environment"], "'environment': did you mean 'environments'?"),
+        (["data", "inf"], "unknown command of data 'inf': did you mean 'info'?"),
+        (["leaderbord"], "unknown command 'leaderbord': did you mean 'leaderboard'?"),
         ([*CLOCK, "--detectr", "x"], "'--detector'"),
         (["run", "--env", "cartpole"], "'--detector' (see oodd-eval run --help)"),
         ([*CLOCK, "--env", "cartpol"], "'cartpol': did you mean 'cartpole'?"),
@@ -480,11 +483,54 @@ def test_help_is_short_and_says_what_to_do_first(capsys):
     assert max(map(len, out.splitlines())) <= 80
     first = re.search(r"^First steps:\n(.*?)\n\n", out, re.MULTILINE | re.DOTALL)[1]
     assert [line.split()[1] for line in first.splitlines()] == [
-        "run", "show", "list", "leaderboard", "data",
+        "run", "list", "leaderboard", "scan", "calibrate", "new",
     ]  # fmt: skip
     assert [int(n) for n in re.findall(r"^  (\d)  ", out, re.MULTILINE)] == [0, 1, 2, 3, 4, 5]
     assert cli.main(["--version"]) == 0
     assert re.fullmatch(r"oodd-eval \d+\.\d+\.\d+\S*\n", capsys.readouterr().out)
+
+
+def commands(group=cli.PROGRAM, context=None):
+    """Yield every command with a context, its further options all shown if the root's are."""
+    context = context or click.Context(group, info_name="oodd-eval", terminal_width=80)
+    for name in group.entries:
+        command = group.get_command(context, name)
+        inner = click.Context(command, context, info_name=name)
+        yield from commands(command, inner) if isinstance(command, Group) else [(command, inner)]
+
+
+def test_help_of_a_command_has_at_most_14_options_and_help_all_has_every_one():
+    for command, context in commands():
+        brief = re.findall(r"^  (--?\w[\w-]*)", command.get_help(context), re.MULTILINE)
+        assert len(brief) <= 14, context.command_path
+        every = {p.opts[0] for p in command.get_params(context) if isinstance(p, click.Option)}
+        assert {*command.further} <= every
+        assert ("--help-all" in brief) == (len(every) > 14) == bool(command.further)
+        context.meta[ALL] = True
+        text = command.get_help(context)
+        assert {*re.findall(r"^  (--?\w[\w-]*)", text, re.MULTILINE)} == every
+        assert all(f"\n{heading}:\n" in text for heading in command.further.values())
+        context.meta[ALL] = False
+
+
+def test_further_options_are_completed_and_work(run):
+    assert run("run", "--help-all")[0] == 0
+    shell = ShellComplete(cli.PROGRAM, {}, "oodd-eval", cli.COMPLETION)
+    assert {i.value for i in shell.get_completions(["run"], "--hor")} == {"--horizon"}
+    assert run(*CLOCK, "--collect-only", "--horizon", "1,2", "-q")[1] == "16 cells in 2 fits\n"
+
+
+@pytest.mark.parametrize("group", ["data", "leaderboard", "policies"])
+def test_a_group_alone_prints_its_commands(run, group):
+    assert run(group) == run(group, "--help")
+    code, out, err = run(group)
+    assert (code, err) == (0, "")
+    assert "\nCommands:\n" in out
+
+
+def test_environments_and_kinds_are_listed_by_either_name(run):
+    assert run("list", "environments") == run("list", "envs")
+    assert run("list", "kinds") == run("list", "anomalies")
 
 
 @pytest.mark.parametrize(

@@ -65,7 +65,10 @@ def progress_shown(doing: str, *, quiet: bool) -> Iterator[Callable[[str], objec
         yield lambda part: status.update(f"{doing}: {part}")
 
 
-@command("leaderboard submit oodd-results --detector mine --wheel dist/oodd_mine-0.1.0.whl")
+@command(
+    "leaderboard submit oodd-results --detector mine --wheel dist/oodd_mine-0.1.0.whl",
+    further={"Other": "--sha256 --variant"},
+)
 @click.argument("directory", type=DIRECTORY, help="results of oodd-eval run")
 @click.option(
     "--detector", required=True, metavar="ROW", help="the row, such as mine or 'mine[window=5]'"

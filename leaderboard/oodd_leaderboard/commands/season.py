@@ -54,6 +54,7 @@ def _bits(text: str) -> int:
     "leaderboard season --entries leaderboard/entries --output leaderboard/seasons/2026-11",
     "leaderboard season --entries mine --env cartpole,tank --train 12 --calibration 40 --test 4",
     "leaderboard season --bits 7e0c5a4df6db7db56e4a2ab8c1e4c9a1 --output rebuilt",
+    further={"Other": "--cap --executor -p"},
     plugins=True,
 )
 @click.option("--entries", type=DIRECTORY, help="what to run (default: only record the split)")

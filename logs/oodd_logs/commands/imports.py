@@ -36,6 +36,7 @@ _DETECTORS: Final = "mewma,mahalanobis,range,clock"  # fitted in seconds, withou
 @command(
     "data import arm.toml --root logs",
     "data import plant --env pump --format csv --train logs/a --calibration logs/b",
+    further={"Columns": "--discrete --group", "Other": "--json -p"},
     plugins=True,
 )
 @click.argument(

@@ -60,6 +60,11 @@ _COLUMNS: Final = (
     "scan logs --fine 'monday-*,run-07' --drop delete.txt",
     "scan logs --recipe arm.toml --detector pe --jobs 4",
     "scan today --recipe arm.toml --watchdog arm.npz --mcap scan.mcap",
+    further={
+        "How logs are read": "--format --read",
+        "Judging": "--param --watchdog -p",
+        "Further files": "--keep --rerun --mcap --served",
+    },
     plugins=True,
 )
 @click.argument("logs", type=LOGS)
