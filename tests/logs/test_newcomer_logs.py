@@ -30,7 +30,7 @@ def test_the_page_shows_what_its_commands_print_and_finds_the_slip(session, caps
     for line in COMMANDS:
         assert session.run(line) == 0, line
         printed.append(capsys.readouterr().out)
-    table = re.search(r"```text\nlogs: csv.*?\n\n(.*?)```", SECTION, re.DOTALL)[1]
+    table = re.search(r"```text\nlogs: csv.*?\n\n(.*?)```", TEXT, re.DOTALL)[1]
     for line in table.splitlines()[2:]:
         assert line.rstrip() in printed[0], f"the page shows {line!r}"
     said = " ".join(printed[0].split())
