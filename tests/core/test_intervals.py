@@ -213,7 +213,7 @@ def test_intervals_of_100_samples_cover_the_truth():
 @pytest.mark.slow
 def test_with_20_seeds_95_percent_intervals_cover_at_least_91_percent():
     script = coverage_script()
-    text = (ROOT / "docs/metrics.md").read_text(encoding="utf-8")
+    text = (ROOT / "benchmarks/README.md").read_text(encoding="utf-8")
     for scenario in script.SCENARIOS:
         if isinstance(scenario, (script.Calibrated, script.OnBoard)):
             continue  # see below, and what takes minutes
