@@ -16,6 +16,7 @@ from oodd_eval.results.record import Record
 ROOT = Path(__file__).parents[2]
 BOARD = ROOT / "leaderboard"
 README, RESULTS = ROOT / "README.md", ROOT / "docs" / "results.md"
+DETAILS = sorted((ROOT / "docs" / "results").glob("*.md"))
 INTERVENTIONS = ROOT / "docs" / "interventions.md"
 FAILURES = ROOT / "docs" / "failures.md"
 

@@ -24,6 +24,7 @@ from unittest.mock import patch
 import sentences
 from committed import (
     BOARD,
+    DETAILS,
     FAILURES,
     INTERVENTIONS,
     README,
@@ -38,7 +39,6 @@ from committed import (
     of_reproductions,
     overview,
     primary,
-    ranking,
     rollouts,
 )
 from oodd_interventions.columns import ALL, COLUMNS, row_of
@@ -54,7 +54,7 @@ from oodd_eval.results.identity import Setting
 from oodd_eval.results.strengths import DETECTION, Strengths
 from oodd_eval.results.tables import Tables
 
-PAGES = (README, RESULTS, INTERVENTIONS, FAILURES)
+PAGES = (README, RESULTS, *DETAILS, INTERVENTIONS, FAILURES)
 
 MAIN = Path(__file__).with_name("main.jsonl.xz")
 """Records of the README's main command: ``records.jsonl`` of its results."""
@@ -96,14 +96,6 @@ def by_environment(name: str) -> str:
     return " | ".join([*pairs, *(f"{share:.0f}" for share in missed)])
 
 
-def by_group(name: str) -> str:
-    """Return matched AUC over all cells and by group, and two shares of alarms, on mini."""
-    groups = (board("mini").in_group(group) for group in ("sensor", "dynamics"))
-    aucs = [mean("mini", name, "auc_matched", anomalies=group) for group in groups]
-    overall, *alarms = (mean("mini", name, metric) for metric in HEADLINE)
-    return cells([overall, *aucs, *alarms])
-
-
 def at_horizons(name: str) -> str:
     """Return three metrics of a detector, each at three horizons."""
     return cells(mean("horizons", Setting(name, h), m) for m in HEADLINE for h in (1, 10, 20))
@@ -138,32 +130,6 @@ def beside_oracle(cells_of: str) -> str:
         for row in ("oracle-gym", "pe-a")
         for metric in HEADLINE[:2]
         for suite in NOISE
-    )
-
-
-@functools.cache
-def archived(split: str) -> dict[str, dict[str, str]]:
-    """Return the cells of a board of protocol 2 by detector, at Δ = 1, and column."""
-    archive = (ROOT / "docs" / "archive" / "protocol-2.md").read_text(encoding="utf-8")
-    section = archive.split(f"## Board of {split}:")[1].split("\n## ")[0]
-    rows = [[c.strip() for c in x.split("|")[1:-1]] for x in section.splitlines() if x[:1] == "|"]
-    head, _, *rows = rows
-    named = (dict(zip(head, row, strict=True)) for row in rows)
-    return {r["detector"]: r for r in named if r["settings"].removesuffix(", 3 seeds") == "Δ=1"}
-
-
-def now(split: str, name: str, metric: str) -> float:
-    """Return a mean of today's board in per cent."""
-    return 100 * float(ranking(split)[name][metric])
-
-
-def of_protocols(name: str) -> str:
-    """Return two metrics on two splits, each under protocol 2, from the archive, and today."""
-    metrics = {"matched AUC": "auc_matched", "found within 20": "found_within_20_at_5pct"}
-    return " | ".join(
-        f"{archived(split)[name][column].split()[0]} → {now(split, name, metric):.1f}"
-        for column, metric in metrics.items()
-        for split in ("mini", "standard")
     )
 
 
@@ -210,19 +176,13 @@ def logs() -> dict[str, Board]:
     return {board.environments[0]: board for board in of_splits}
 
 
-def on_logs(metric: str = "") -> Row:
-    """Return a detector's means over sets of logs of a metric, by default that by which they rank.
-
-    A dash stands where the detector was not run.
-    """
-
-    def value(board: Board, name: str) -> str:
-        if Setting(name) not in board.entries:
-            return "–"  # noqa: RUF001  an en dash
-        over = board.environments, board.anomalies
-        return f"{100 * board.mean(Setting(name), *over, metric or board.ranking).value:.1f}"
-
-    return lambda name: " | ".join(value(logs()[environment], name) for environment in LOGS)
+def on_logs(name: str) -> str:
+    """Return a detector's means over sets of logs of the metric by which they rank."""
+    entry, rows = Setting(name), (logs()[environment] for environment in LOGS)
+    return cells(
+        100 * board.mean(entry, board.environments, board.anomalies, board.ranking).value
+        for board in rows
+    )
 
 
 @functools.cache
@@ -306,20 +266,17 @@ TABLES: dict[str, Row] = {
     "board mini": of_board("mini"),
     "board standard": of_board("standard"),
     "environments": by_environment,
-    "papers": by_group,
     "horizons": at_horizons,
     "noise": under_noise,
     "noise kinds": of_kind_under_noise,
     "oracles": beside_oracle,
-    "protocols": of_protocols,
     "losses mini-paper": of_reproductions("mini", "mini-paper"),
     "losses reduced-paper": of_reproductions("standard", "reduced-paper"),
     "ladder": of_ladder,
     "ladder oracles": by_rung,
     "worlds": in_worlds,
     "claims": verdicts,
-    "logs": on_logs(),
-    "logs false": on_logs("false_episodes_at_10pct"),
+    "logs": on_logs,
     "mask": of_study("Return saved by mask"),
     "mask costs": of_study("What mask prevents"),
     "mask harmless": of_study("Faults that mask cannot mend"),
