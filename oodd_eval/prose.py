@@ -2,6 +2,7 @@
 
 import io
 import itertools
+import math
 import re
 import textwrap
 from collections.abc import Callable, Sequence
@@ -17,8 +18,10 @@ from tabulate import tabulate
 class Table:
     """A titled table of texts, the first `labels` columns set to the left, with a note below it.
 
-    On a terminal each row has the colour of its position in `colours`, if there are any, and
-    `wrap` lets headings and names take several lines where the table is too wide.
+    On a terminal each row has the colour of its position in `colours`, if there are any. A table
+    that is too wide has headings and labels of several lines. If it still is, one that is `whole`
+    gives way to the first of `narrower` that fits, and then loses its intervals from the right;
+    any other comes in parts of its columns.
     """
 
     title: str
@@ -27,7 +30,8 @@ class Table:
     labels: int = 1
     note: str = ""
     colours: Sequence[str] = ()
-    wrap: bool = False
+    whole: bool = False
+    narrower: Sequence["Table"] = ()
 
     @property
     def alignment(self) -> tuple[str, ...]:
@@ -38,18 +42,6 @@ class Table:
         """Return the table with these columns only."""
         rows = [[row[i] for i in indices] for row in self.rows]
         return replace(self, header=[self.header[i] for i in indices], rows=rows)
-
-    def transposed(self) -> "Table":
-        """Return the table with rows and columns exchanged.
-
-        Of several labels a first one stands where it changes: a group of columns has its name once.
-        """
-        columns = [list(column) for column in zip(self.header, *self.rows, strict=True)]
-        header = columns[0]
-        if self.labels > 1:
-            pairs = itertools.pairwise(header)
-            header = [header[0], *("" if text == before else text for before, text in pairs)]
-        return replace(self, header=header, rows=columns[1:], labels=1, colours=())
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,70 +120,123 @@ def terminal_text(sections: Sequence[Section]) -> str:
 
 
 def print_table(table: Table, console: Console, width: int = 0) -> None:
-    """Print one table within a width, by default the console's: as it is, turned, or in parts."""
-    if table.wrap:
-        print_prose(table.title, console, "bold")
-    else:
-        console.print(Text(table.title, "bold"))
+    """Print one table within a width, by default the console's, its rows as rows."""
+    print_prose(table.title, console, "bold")
     for part in _fitting(table, width or console.width):
-        lines = grid(part, "simple").splitlines()
-        colours = ["", "", *(part.colours or [""] * (len(lines) - 2))]
-        for line, colour in zip(lines, colours, strict=True):
-            console.print(Text(line, colour))
+        header, *rows = _aligned(part)
+        rule = "  ".join("-" * n for n in _widths(part))
+        colours = [*part.colours] or [""] * len(rows)
+        console.print(Text("\n".join([*header, rule])))
+        for lines, colour in zip(rows, colours, strict=True):
+            console.print(Text("\n".join(lines), colour))
         console.print("")
     if table.note:
         print_prose(table.note + "\n", console, "dim")
 
 
 def _fitting(table: Table, width: int) -> list[Table]:
-    """Return the table, the table turned, or parts of its columns, whichever first fits."""
-    candidates = [table, table.transposed()]
-    if table.wrap:
-        wrapped = [_wrapped(candidate, width) for candidate in candidates]
-        candidates = [table, wrapped[0], candidates[1], wrapped[1]]
-        table = wrapped[0]
-    for candidate in candidates:
-        if _width(candidate) <= width:
-            return [candidate]
+    """Return what of a table fits: its first shape that does, or parts of its columns."""
+    shapes = [table, *table.narrower]
+    for column in reversed(range(table.labels, len(table.header)) if table.whole else ()):
+        bare = [
+            [_bare(text) if i == column else text for i, text in enumerate(row)]
+            for row in shapes[-1].rows
+        ]
+        shapes += [replace(shapes[-1], rows=bare)] * (bare != shapes[-1].rows)
+    for shape in shapes:
+        for candidate in (shape, *(_wrapped(shape, width, room) for room in _ROOMS)):
+            if _width(candidate) <= width:
+                return [candidate]
+    if table.whole:
+        return [candidate]
     labels = list(range(table.labels))
     parts = [labels]
     for column in range(table.labels, len(table.header)):
         wider = [*parts[-1], column]
-        if parts[-1] == labels or _width(table.columns(wider)) <= width:
+        if parts[-1] == labels or _width(candidate.columns(wider)) <= width:
             parts[-1] = wider
         else:
             parts.append([*labels, column])
-    return [table.columns(part) for part in parts]
+    return [candidate.columns(part) for part in parts]
 
 
-def _wrapped(table: Table, width: int) -> Table:
-    """Return a table whose headings and labels take several lines where they are long."""
-    most = max(_NARROW, width // 3)
+def _bare(text: str) -> str:
+    """Return a figure without its interval."""
+    return _INTERVAL.sub("", text)
 
-    def lines(text: str, room: int) -> str:
-        wrapper = textwrap.TextWrapper(room, break_long_words=room >= most)
-        wrapper.wordsep_re = _PARTS
-        return "\n".join(wrapper.wrap(text))
 
+def _wrapped(table: Table, width: int, room: int) -> Table:
+    """Return a table whose headings and labels take several lines where they are long.
+
+    Words of headings are divided where they are wider than the column's figures and the room.
+    """
     columns = [[row[i] for row in table.rows] for i in range(len(table.header))]
-    longest = [max(map(len, column), default=0) for column in columns]
+    figures = [max(map(len, column), default=0) for column in columns]
     header = [
-        lines(text, most if i < table.labels else max(longest[i], _NARROW))
+        _lines(text, width // 3 if i < table.labels else max(figures[i], room))
         for i, text in enumerate(table.header)
     ]
-    rows = [
-        [lines(text, most) if i < table.labels else text for i, text in enumerate(row)]
-        for row in table.rows
-    ]
-    return replace(table, header=header, rows=rows)
+    wide = [max(w, *map(len, h.split("\n"))) for w, h in zip(figures, header, strict=True)]
+    for i in sorted(range(table.labels), key=wide.__getitem__, reverse=True):
+        # Of a whole table labels get what other columns leave, but no word is divided for them.
+        pieces = [len(piece) for text in columns[i] for piece in _PARTS.split(text) if piece]
+        left = width - sum(wide) + wide[i] - 2 * (len(wide) - 1)
+        least = min(max(pieces, default=0), width // 3)
+        wide[i] = min(wide[i], max(left, least) if table.whole else width // 3)
+        columns[i] = [_lines(text, wide[i]) for text in columns[i]]
+    return replace(table, header=header, rows=[[*row] for row in zip(*columns, strict=True)])
 
 
-_NARROW: Final = 9
-"""Width of a column that headings are wrapped to where its figures are narrower."""
+def _lines(text: str, room: int) -> str:
+    """Return text in lines of a room; longer words are divided, those of letters with a hyphen."""
+    wrapper = textwrap.TextWrapper(max(room, 1))
+    wrapper.wordsep_re = _PARTS
+    return "\n".join(wrapper.wrap(_WORD.sub(lambda word: _divided(word[0], room), text)))
 
-_PARTS: Final = re.compile(r"(\s+|[^-\[,:.=\s]*[-\[,:.=]+)")
+
+def _divided(word: str, room: int) -> str:
+    """Return a word that is too long for a room with hyphens between even parts of it."""
+    if len(word) <= room or room < _ROOMS[-1]:
+        return word
+    size = math.ceil(len(word) / math.ceil(len(word) / (room - 1)))
+    return "-".join(word[i : i + size] for i in range(0, len(word), size))
+
+
+_ROOMS: Final = (11, 6)
+"""Widths of columns that headings are wrapped to where figures are narrower, as tried."""
+
+_PARTS: Final = re.compile(r"(\s+)|(?<=[-\[,:.=])(?=[^-\[,:.=\s])|(?<=[a-z])(?=[A-Z])")
 """Ends of lines are between words, and in names behind what separates their parts."""
+
+_WORD: Final = re.compile(r"[^\W\d_]+")
+
+_INTERVAL: Final = re.compile(r" \[[^\]]*\]")
+
+
+def _widths(table: Table) -> list[int]:
+    lines = zip(table.header, *table.rows, strict=True)
+    return [max(len(line) for text in column for line in text.split("\n")) for column in lines]
 
 
 def _width(table: Table) -> int:
-    return max(map(len, grid(table, "simple").splitlines()), default=0)
+    return sum(_widths(table)) + 2 * (len(table.header) - 1)
+
+
+def _aligned(table: Table) -> list[list[str]]:
+    """Return the lines of the header and of every row, columns two spaces apart."""
+    widths, lines = _widths(table), []
+    for row in (table.header, *table.rows):
+        columns = [
+            [line.ljust(n) if i < table.labels else line.rjust(n) for line in text.split("\n")]
+            for i, (text, n) in enumerate(zip(row, widths, strict=True))
+        ]
+        parts = itertools.zip_longest(*columns)
+        lines.append(
+            [
+                "  ".join(
+                    " " * n if text is None else text for text, n in zip(part, widths, strict=True)
+                ).rstrip()
+                for part in parts
+            ]
+        )
+    return lines

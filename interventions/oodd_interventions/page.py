@@ -77,7 +77,7 @@ def _of_act(act: str, records: Records) -> Section:
     note = f"Paired by seeds: {'; '.join(behind)}." * bool(behind)
     title = f"Return saved by {act}, in brackets the placebo (%)"
     header = ["detector", "mean", "placebo", "harm on nominal", *names]
-    tables = [Table(title, header, lines, note=note, wrap=True)]
+    tables = [Table(title, header, lines, note=note)]
     title = f"What {act} prevents and costs (delay in rows, the rest in %)"
     tables.append(_table(title, rows, [*INTERVENTIONS][2:]))
     tables += _useless(act, [r for r in cells if math.isnan(_value(r, _SAVED))])
@@ -118,13 +118,13 @@ def _useless(act: str, cells: Records) -> list[Table]:
     title = f"Faults that {act} cannot mend: their cost, and that of acting (% of nominal return)"
     texts = [[*labels, *(line.get(row, "") for row in rows)] for labels, line in lines.items()]
     header = ["environment", "anomaly", "fault", *rows]
-    return [Table(title, header, texts, labels=2, wrap=True)] * bool(cells)
+    return [Table(title, header, texts, labels=2)] * bool(cells)
 
 
 def _table(title: str, rows: Records, names: Collection[str]) -> Table:
     """Return a table with a row a detector, and a column a name."""
     lines = [[row_of(r), *(_text(r, name) for name in names)] for r in rows]
-    return Table(title, ["detector", *(COLUMNS[n].short for n in names)], lines, wrap=True)
+    return Table(title, ["detector", *(COLUMNS[n].short for n in names)], lines)
 
 
 def _overall(records: Records) -> Records:

@@ -1,6 +1,7 @@
 """The terminal reporter: an observer that prints what the runner does, and tables at its end."""
 
 import math
+import shlex
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -17,6 +18,7 @@ from oodd_eval.names import counted
 from oodd_eval.plugins import hookimpl
 from oodd_eval.prose import print_prose, print_sections
 from oodd_eval.results.board import boards, level_of, ranked_by
+from oodd_eval.results.directory import REPORT
 from oodd_eval.results.record import STATUSES, Record
 from oodd_eval.results.report import Report
 from oodd_eval.results.strengths import NO_UNITS
@@ -29,7 +31,7 @@ _COLOURS = {"ok": "green", "unavailable": "yellow", "incompatible": "yellow"}
 
 
 class TerminalReporter(Display):
-    """Print a header, a line per fit, tables, failures and a summary; as a context, until its end.
+    """Print a header, a line per fit, failures and a summary; as a context, until its end.
 
     What runs is shown between the lines, but for a negative verbosity.
     `verbosity` -1 prints the summary only; 1, a line per cell and, from `log`, why fits failed.
@@ -85,11 +87,8 @@ class TerminalReporter(Display):
 
     @hookimpl
     def oodd_run_finished(self, records: list[Record], interrupted: bool) -> None:
-        """Print the tables, the failures and the summary."""
+        """Print the failures and the summary."""
         self.__exit__(None, None, None)
-        if self.verbosity >= 0 and any(r.ok for r in records):
-            self.line("")
-            self.tables(records)
         self.failures(records)
         seconds = time.perf_counter() - self._start
         earlier = f" ({self._resumed} from earlier runs)" if self._resumed else ""
@@ -97,7 +96,7 @@ class TerminalReporter(Display):
         self.line(f"{summary(records)}{earlier} in {seconds:.1f} s{end}")
 
     def tables(self, records: Sequence[Record]) -> None:
-        """Print the tables of every board among some records."""
+        """Print where the reader's row stands and one table, for every board of some records."""
         report = Report(
             records,
             intervals=self.intervals,
@@ -106,6 +105,7 @@ class TerminalReporter(Display):
             level=self._level,
             paper=self._paper,
         )
+        self.line("")
         print_sections(report.sections, self.console)
 
     def failures(self, records: Sequence[Record]) -> None:
@@ -136,6 +136,13 @@ class TerminalReporter(Display):
             elif not math.isnan(spent):
                 parts.append(f"{spent:.1f} s")
         self.line("  ".join(parts), _COLOURS.get(last.status, "red"))
+
+
+def rest(path: Path) -> str:
+    """Return where everything is that a run's table leaves out."""
+    file = path / REPORT
+    more = f", {file}" * file.is_file()
+    return f"everything else: oodd-eval show {shlex.quote(str(path))} --wide{more}"
 
 
 def summary(records: Sequence[Record]) -> str:

@@ -31,7 +31,7 @@ from oodd_eval.cli import (
 )
 from oodd_eval.cli.console import make_console
 from oodd_eval.cli.plugins import discovered
-from oodd_eval.cli.reporter import TerminalReporter
+from oodd_eval.cli.reporter import TerminalReporter, rest
 from oodd_eval.data.bounded import read_toml
 from oodd_eval.data.files import write_text
 from oodd_eval.data.layout import log_facts
@@ -174,17 +174,21 @@ def run(options: Options) -> int:
     with reporter:
         done = run_plan(plan, split, plugins, settings, results, observers=[reporter, doubts])
     doubts.print(doubts_after(plan, split, results))
-    for sentence in costly_voices(done.records, results):
-        doubts.say(sentence)
     say_notes(results.notes)
     if done.records:
+        records = results.records()
         report = Report(
-            results.records(), intervals=options.intervals, units=split.units, level=options.level
+            records,
+            intervals=options.intervals,
+            units=split.units,
+            level=options.level,
+            remarks=[*costly_voices(records, results)],
         )
-        path = results.path / REPORT
-        write_text(path, FORMATS["markdown"].render(report))
+        write_text(results.path / REPORT, FORMATS["markdown"].render(report))
         if options.verbosity >= 0:
-            console.print(f"results in {results.path}, tables in {path}")
+            if any(record.ok for record in done.records):
+                reporter.tables(done.records)
+            console.print(rest(results.path))
     if left := _left(plan, done, fresh=options.fresh):
         console.print(left)
     if done.interrupted:

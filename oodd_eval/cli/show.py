@@ -21,7 +21,7 @@ from oodd_eval.cli import (
     together,
 )
 from oodd_eval.cli.console import make_console
-from oodd_eval.cli.reporter import TerminalReporter, summary
+from oodd_eval.cli.reporter import TerminalReporter, rest, summary
 from oodd_eval.data.facts import ENVIRONMENTS, in_order
 from oodd_eval.data.split import Split, load_split, split_directories
 from oodd_eval.errors import UsageError
@@ -121,6 +121,7 @@ def show(options: Options) -> int:
         units=units,
         level=options.level,
         paper=options.paper,
+        remarks=[*costly_voices(records, results)] if layout or options.wide else (),
     )
     if layout:
         print(layout.render(report), end="")
@@ -131,12 +132,13 @@ def show(options: Options) -> int:
             reporter.console.print(
                 f"split {split.name}, digest {split.digest[:12]}, in {split.path}\n"
             )
-    print_sections(report.sections, reporter.console)
-    for sentence in costly_voices(records, results) if options.verbosity >= 0 else ():
-        print_prose(sentence, reporter.console, "yellow")
     if not options.detector:
         reporter.failures(records)
-    reporter.console.print(summary(records))
+        if code:
+            reporter.console.print(f"{summary(records)}\n")
+    print_sections(report.sections, reporter.console)
+    if report.detail == "brief" and not options.detector:
+        reporter.console.print(rest(options.directory))
     return code
 
 

@@ -87,11 +87,11 @@ class Results(Sequence[Record]):
         return f"Results({cells} of {splits}: {', '.join(self.rows)}; {self._states or 'none'})"
 
     def __str__(self) -> str:
-        """Return what ``oodd-eval show`` prints: tables, sentences, why cells failed, how many."""
+        """Return what ``oodd-eval show`` prints: why cells failed, and where one's row stands."""
         if not self.records:
             return repr(self)
-        tables = terminal_text(self._report.sections)
-        return "\n".join([tables.rstrip("\n"), "", *self._failures, self._states])
+        failures = [*self._failures, self._states, ""] if self._failures else []
+        return "\n".join([*failures, terminal_text(self._report.sections).rstrip("\n")])
 
     def _repr_html_(self) -> str:
         """Return the tables that ``oodd-eval show`` prints, for notebooks."""

@@ -4,7 +4,7 @@ import functools
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final, Literal
 
 from oodd_eval.metrics.catalogue import HEADLINE, LEVELS, METRICS, NAMES, UNDEFINED, metric_info
@@ -35,7 +35,8 @@ class Report:
     intervals
         Whether means have their 95 % intervals.
     detail
-        ``"brief"`` is what a run prints at its end: the headline. ``"wide"`` adds means by
+        ``"brief"`` is what a run prints at its end: the headline with a few notes, beside what is
+        asked for by `intervals`, `level`, `paper` and rows' metrics. ``"wide"`` adds means by
         environment and group, by detector seed, and all metrics and levels of alarms; ``"full"``
         also each row's cells and all failures.
     detector
@@ -49,6 +50,8 @@ class Report:
         or the strictest weaker one that the records have.
     paper
         Whether what the paper's alarm does is in it, too; in a ``"full"`` report it always is.
+    remarks
+        Sentences on the fits behind the records, below the last table; a ``"brief"`` one has none.
     """
 
     records: Sequence[Record]
@@ -60,6 +63,7 @@ class Report:
     title: str = field(default="Results", kw_only=True)
     level: str = field(default="", kw_only=True)
     paper: bool = field(default=False, kw_only=True)
+    remarks: Sequence[str] = field(default=(), kw_only=True)
 
     def __str__(self) -> str:
         """Return the report as plain text, its verdicts first."""
@@ -69,9 +73,13 @@ class Report:
     def sections(self) -> list[Section]:
         """The sections, made when a renderer asks for them."""
         make = self._of_detector if self.detector else self._of_board
-        return [make(_in_order(board)) for board in boards(self.records)]
+        parts = [make(board) for board in boards(self.records)]
+        if parts and self.detail != "brief":
+            parts[-1] = replace(parts[-1], notes=[*parts[-1].notes, *self.remarks])
+        return parts
 
     def _of_board(self, board: Board) -> Section:
+        verdict, board = verdict_of(board, self.level), _in_order(board)
         ok = sum(r.ok for r in board.records)
         counts = f"{len(board.records)}, of which {ok} ok and {len(board.records) - ok} failed"
         distinct: list[Table] = []
@@ -79,26 +87,34 @@ class Report:
         for table in filter(None, self._tables(board)):
             if all((table.header, table.rows) != (t.header, t.rows) for t in distinct):
                 distinct.append(table)
+        title = f"Split {board.split}"
+        if self.detail == "brief":
+            several = len(boards(self.records)) > 1
+            facts = f"Split {board.conditions}." if several or board.limit else ""
+            essentials = Tables(board, level=self.level).essentials(facts)
+            return Section(title, tables=distinct, notes=essentials, verdict=verdict)
         return Section(
-            f"Split {board.split}",
+            title,
             [f"Cells: {counts}."],
             findings_of(board, self.level),
             distinct,
             notes=tables.notes(board),
-            verdict=verdict_of(board, self.level),
+            verdict=verdict,
         )
 
     def _tables(self, board: Board) -> Iterator[Table | None]:
         means = Tables(board, self.intervals, level=self.level)
         full, brief = self.detail == "full", self.detail == "brief"
         ranked = not board.leaves_out([board.ranking])
-        strengths = StrengthTables(board, self.intervals, self.units)
-        if not board.paired:
-            yield from means.of_logs(whole=not brief)
+        headline = means.headline()
+        strengths = StrengthTables(board, self.intervals, self.units).overview(places=full)
+        if brief:
+            yield replace(headline, note="") if headline else next(iter(strengths), None)
+            yield means.published()
         else:
-            yield means.headline()
-        yield from strengths.overview(places=full, whole=not brief)
-        if not brief:
+            yield headline
+            yield from [] if board.paired else means.of_logs()
+            yield from strengths
             yield means.separability() if board.paired and ranked else None
             yield means.seeds()
             yield means.attribution()

@@ -1,6 +1,5 @@
 """One row beside another, and the sentence that comes first."""
 
-import contextlib
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -10,12 +9,16 @@ from oodd_eval.data.facts import ENVIRONMENTS, in_order, title_of
 from oodd_eval.errors import ResultsError, UnknownNameError, UsageError
 from oodd_eval.metrics.auc import Contribution
 from oodd_eval.metrics.bootstrap import nan_mean
-from oodd_eval.metrics.catalogue import LEVELS, RANKING, metric_info
+from oodd_eval.metrics.catalogue import RANKING, UNDEFINED, metric_info
 from oodd_eval.metrics.ranking import Position, Row, differences
 from oodd_eval.names import counted
-from oodd_eval.results.board import Board, Conditions, contribution, ranked_by, supervised
+from oodd_eval.results.board import Board, Column, Conditions, contribution, ranked_by, supervised
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record
+from oodd_eval.results.tables import best_first, ordering_metric
+
+SHIPPED: Final = "oodd-eval"
+"""The distribution whose detectors are no reader's own."""
 
 
 def terms_of(records: Iterable[Record], metric: str) -> Row:
@@ -74,22 +77,35 @@ class PairedComparison:
     note: str = ""
 
     @property
-    def verdict(self) -> str:
-        """One sentence, and the note: which row is better, or that no difference is shown."""
-        info = metric_info(self.metric)
-        sign = -1 if (self.difference < 0) != (info.better == "lower") else 1
-        rows = (self.first, self.second)[::sign]
+    def told_apart(self) -> bool:
+        """True if the interval excludes 0."""
+        return self.low > 0 or self.high < 0
+
+    @property
+    def first_is_better(self) -> bool:
+        """Whether the first row has the better mean, or both have the same."""
+        return self.difference == 0 or (
+            (self.difference < 0) == (metric_info(self.metric).better == "lower")
+        )
+
+    @property
+    def amount(self) -> str:
+        """The advantage of the better row with its interval, as ``6.0 points [4.1, 7.9]``."""
         # The advantage of the better row, whatever the better side.
         turn = math.copysign(1.0, self.difference)
-        ends = (turn * self.low, turn * self.high)[:: int(turn)]
-        amount, low, high = map(info.text, (abs(self.difference), *ends))
-        unit = {"percent": " points", "steps": " steps"}.get(info.unit, "")
-        scope, end = f"in {info.phrase} {in_words(self.environments)}".rstrip(), f".{self.note}"
-        if ends[0] > 0:
-            return f"{rows[0]} beats {rows[1]} by {amount}{unit} [{low}, {high}] {scope}{end}"
+        low, high = (turn * self.low, turn * self.high)[:: int(turn)]
+        return with_interval(abs(self.difference), low, high, self.metric)
+
+    @property
+    def verdict(self) -> str:
+        """One sentence, and the note: which row is better, or that no difference is shown."""
+        rows = (self.first, self.second)[:: 1 if self.first_is_better else -1]
+        scope = f"in {metric_info(self.metric).phrase} {in_words(self.environments)}".rstrip()
+        if self.told_apart:
+            return f"{rows[0]} beats {rows[1]} by {self.amount} {scope}.{self.note}"
         return (
             f"No difference is shown between {rows[0]} and {rows[1]} {scope}: "
-            f"{amount}{unit} [{low}, {high}], p = {self.p:.2g}{end}"
+            f"{self.amount}, p = {self.p:.2g}.{self.note}"
         )
 
     def __str__(self) -> str:
@@ -105,6 +121,39 @@ class PairedComparison:
 
 
 _UNITS: Final = {"percent": " %", "steps": " steps"}
+
+
+def with_interval(difference: float, low: float, high: float, metric: str) -> str:
+    """Return a difference with its interval, of as many digits as tell its ends from 0.
+
+    Parameters
+    ----------
+    difference, low, high
+        The difference of two means and its interval, NaN where it has no end.
+    metric
+        What they are means of.
+
+    Returns
+    -------
+    str
+        Such as ``6.0 points [4.1, 7.9]``.
+    """
+    info = metric_info(metric)
+    scale, unit = {"percent": (100, " points"), "steps": (1, " steps")}.get(info.unit, (1, ""))
+    ends = [scale * end for end in (low, high) if not math.isnan(end)]
+    least = 1 if unit else 3
+    is_told = low > 0 or high < 0
+    seen = all if is_told else any
+    digits = (n for n in range(least, _MOST_DIGITS) if seen(round(end, n) for end in ends))
+    n = next(digits, _MOST_DIGITS if is_told else least)
+    amount = f"{scale * difference:z.{n}f}{unit}"
+    if not ends:
+        return f"{amount} (no interval: too few test episodes)"
+    texts = (UNDEFINED if math.isnan(end) else f"{scale * end:z.{n}f}" for end in (low, high))
+    return f"{amount} [{', '.join(texts)}]"
+
+
+_MOST_DIGITS: Final = 4
 
 
 def in_words(environments: Sequence[str]) -> str:
@@ -190,38 +239,86 @@ def compare_rows(
     return PairedComparison(test.first, test.second, metric, values, *figures, over, note)
 
 
-def verdict_of(board: Board, level: str = "") -> str:
-    """Return the sentence that comes first: the best row against the second, or what one row does.
+def own_row(board: Board) -> Setting:
+    """Return the reader's own row: the best that oodd-eval does not ship, else the first record's.
 
-    Rows that have no value in every cell, or know more than nominal trajectories, are passed over
-    where others are left. Rows that learn from failures are never compared with others.
+    What an adapter makes of a name with a colon is the reader's, too.
+    """
+    plugins = {r.setting: r.plugin for r in board.records}
+    shipped = {row for row, name in plugins.items() if name.startswith(f"{SHIPPED}:")}
+    own = (row for row in best_first(board) if row not in shipped or ":" in row.detector)
+    return next(own, board.entries[0])
+
+
+def verdict_of(board: Board, level: str = "") -> str:
+    """Return the sentence that comes first: where the reader's own row stands, see `own_row`.
+
+    It is compared with the first row of the table, or the second where it is the first. Rows that
+    know more than nominal trajectories are passed over, and those that learn from failures are
+    compared with one another alone.
 
     Parameters
     ----------
     board
-        The rows.
+        The rows, in the order in which they were named.
     level
         Suffix of the level of guaranteed alarms, by default the board's.
 
     Returns
     -------
     str
-        Empty where no row has a figure.
+        Empty where the row has no figure that rows are compared by, and others have.
     """
-    over = board.environments, board.anomalies
-    means = {entry: board.mean(entry, *over, board.ranking) for entry in board.entries}
-    defined = [entry for entry, mean in means.items() if not math.isnan(mean.value)]
-    defined = [entry for entry in defined if entry not in board.supervised] or defined
-    knowing = {r.setting for r in board.records if r.training != "nominal"}
-    eligible = [e for e in defined if not means[e].partial and e not in knowing]
-    rows = sorted(eligible if len(eligible) > 1 else defined, key=lambda e: -means[e].value)
-    if len(rows) > 1:
-        records = [r for r in board.records if r.setting in rows[:2] and r.ok]
-        with contextlib.suppress(ResultsError):  # without a cell in common
-            return compare_rows(records, str(rows[0]), str(rows[1]), board.ranking).verdict
-    first = (rows or board.entries)[0]
-    # Of several rows that nothing ranks none speaks for the others.
-    return _in_words(board, first, level or board.level) if rows or len(board.entries) == 1 else ""
+    own, metric = own_row(board), ordering_metric(board)
+    knowing = {r.setting for r in board.records if r.training not in ("nominal", "failures")}
+    band = [
+        row
+        for row in best_first(board)
+        if (row in board.supervised) == (own in board.supervised)
+        and (row == own or row not in knowing)
+    ]
+    if len(band) == 1:
+        return _in_words(board, own, level or board.level)
+    i = band.index(own)
+    rival = band[0] if i else band[1]
+    place = f"{own} is {_ordinal(i + 1)} of {_number(len(band))}"
+    if len(board.entries) > len(band):
+        place += f" {'rows that learn from failures' if own in board.supervised else 'ranked rows'}"
+    means = [board.of(row, Column(metric)) for row in (own, rival)]
+    if means[0].state:
+        statuses = [r.status for r in board.records if r.setting == own]
+        failed = sum(status != "ok" for status in statuses)
+        cells = counted(len(statuses), "cell(s)")
+        return f"{own} has no place: {means[0].state} in {failed} of {cells}."
+    try:
+        test = compare_rows([r for r in board.records if r.ok], str(own), str(rival), metric)
+    except ResultsError:  # without a cell in common
+        return "" if math.isnan(means[0].value) else f"{place}."
+    ahead = "ahead of" if test.first_is_better else "behind"
+    scope = f" in {metric_info(metric).phrase}"
+    if any(mean.state or mean.partial for mean in means):
+        scope += f", over the {counted(test.cells, 'cell(s)')} that both have"
+    if test.told_apart:
+        return f"{place}, {test.amount} {ahead} {rival}{scope}."
+    return f"{place} and cannot be told from {rival}: {test.amount} {ahead} it{scope}."
+
+
+def _number(n: int) -> str:
+    return _NUMBERS[n - 1] if n <= len(_NUMBERS) else str(n)
+
+
+def _ordinal(n: int) -> str:
+    if n <= len(_ORDINALS):
+        return _ORDINALS[n - 1]
+    teen = n % 100 in (11, 12, 13)
+    return f"{n}{'th' if teen else {1: 'st', 2: 'nd', 3: 'rd'}.get(n % 10, 'th')}"
+
+
+_ORDINALS: Final = (
+    *("first", "second", "third", "fourth", "fifth"),
+    *("sixth", "seventh", "eighth", "ninth", "tenth"),
+)
+_NUMBERS: Final = ("one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
 
 
 def _in_words(board: Board, entry: Setting, level: str) -> str:
@@ -236,12 +333,9 @@ def _in_words(board: Board, entry: Setting, level: str) -> str:
             if not math.isnan(mean)
         )
 
-    alarms = figures(*(f"{name}_{level}" for name in _IN_WORDS))
-    if alarms:
-        percent = f"{100 * LEVELS[level]:g} %"
-        alarms = f"with alarms in at most {percent} of nominal episodes: {alarms}"
-    parts = "; ".join(filter(None, [figures(board.ranking), alarms]))
+    figures_of_alarms = (f"{name}_{level}" for name in _IN_WORDS)
+    parts = figures(board.ranking, *figures_of_alarms)
     return f"{entry} {in_words(board.environments)}: {parts}." if parts else ""
 
 
-_IN_WORDS: Final = ("delay_censored", "missed", "false_episodes")
+_IN_WORDS: Final = ("found_within_20", "found_outcome", "missed", "false_episodes")

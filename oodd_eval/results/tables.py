@@ -58,8 +58,18 @@ def texts(board: Board, entry: Setting, columns: Iterable[Column]) -> list[str]:
 
 def reasons(board: Board, entries: Iterable[Setting], columns: Iterable[Column]) -> list[str]:
     """Return why rows have no figure in columns, a sentence for each reason."""
+    return [
+        f"Undefined for {_listed(rows, 'rows')}: {_listed(columns, 'columns')} ({reason})."
+        for reason, (rows, columns) in _lacking(board, entries, columns).items()
+    ]
+
+
+def _lacking(
+    board: Board, entries: Iterable[Setting], columns: Iterable[Column]
+) -> dict[str, tuple[dict[str, None], dict[str, None]]]:
+    """Return the rows and the columns without a figure by the reason for it."""
     rows = grouped(board.records, lambda r: r.setting)
-    lacking: dict[str, tuple[dict[str, None], dict[str, None]]] = {}  # rows and columns by reason
+    lacking: dict[str, tuple[dict[str, None], dict[str, None]]] = {}
     for entry, column in itertools.product(entries, list(columns)):
         mean = board.of(entry, column._replace(intervals=False))
         if mean.state or not math.isnan(mean.value):
@@ -69,13 +79,10 @@ def reasons(board: Board, entries: Iterable[Setting], columns: Iterable[Column])
                 continue
             if column.anomalies and r.anomaly not in column.anomalies:
                 continue
-            of_reason = lacking.setdefault(why_undefined(r, column.metric), ({}, {}))
-            of_reason[0][str(entry)] = of_reason[1][column.title] = None
-    return [
-        f"Undefined for {_listed(rows, 'rows')}: {_listed(columns, 'columns')} ({reason})."
-        for reason, (rows, columns) in lacking.items()
-        if reason
-    ]
+            if reason := why_undefined(r, column.metric):
+                of_reason = lacking.setdefault(reason, ({}, {}))
+                of_reason[0][str(entry)] = of_reason[1][column.title] = None
+    return lacking
 
 
 def _listed(names: Collection[str], kind: str) -> str:
@@ -114,6 +121,9 @@ ALARMS_OF_OUTCOMES: Final = tuple(name for name in catalogue.GUARANTEED if "outc
 
 WORST: Final = "worst environment"
 """Heading of the column that has the environment in which a row is worst."""
+
+MOST_NOTES: Final = 3
+"""Notes below the table that a run ends with."""
 
 _ALARMS_OF_LOGS: Final = (
     *("events_found", "delay_censored", f"found_within_{catalogue.FOUND_WITHIN[-1]}", "missed"),
@@ -157,40 +167,115 @@ class Tables:
 
         They are the metric that ranks with its interval, the worst environment (with one
         environment a column an anomaly), and found, missed and false episodes of guaranteed alarms.
-        None when no record has any of them.
+        Where it is too wide, the worst anomaly stands for all. None when no record has any of them.
         """
-        board, metric = self.board, self.board.ranking
-        lacking = board.leaves_out([metric]) if board.paired else not self._present([metric])
-        first = [] if lacking else [Column(metric, _heading(metric), intervals=True)]
-        environments = [e for e in board.environments if self._present([metric], [e])]
-        kinds = [kind for kind in board.anomalies if cells_with(metric, self._of(kind))]
-        if first and len(environments) == 1 and 1 < len(kinds) <= len(TABLE1):
-            first += [Column(metric, kind, anomalies=[kind]) for kind in kinds]
-        outcomes = metric == OUTCOME
-        alarms = self.columns(self._at_level(*(_OUTCOMES if outcomes else _FIRST)))
+        board, first, alarms = self.board, self._first, self._alarms_first
         if not first and not alarms:
             return None
-        info = metric_info(metric)
-        titles = [info.title] * bool(first)
-        titles += [f"guaranteed alarms at {percent_of(self.suffix)}"] * bool(alarms)
-        title = " and ".join(titles)
+        places = self._places if first else []
+        title = " and ".join(
+            [metric_info(board.ranking).title] * bool(first)
+            + [f"guaranteed alarms at {percent_of(self.suffix)}"] * bool(alarms)
+        )
+        outcomes = board.ranking == OUTCOME
         note = _joined(
             self._promise(alarms), self._outcome_note() if outcomes else "", unranked(board)
         )
-        table = self.table(f"{title[0].upper()}{title[1:]} (%)", [*first, *alarms], note)
-        if len(environments) > 1:
-            worst = [self._worst(entry) for entry in self.order]
-            for row, text in zip((table.header, *table.rows), (WORST, *worst), strict=True):
-                row.insert(table.labels + 1, text)
-        return replace(table, wrap=True)
+        title = f"{title[0].upper()}{title[1:]} (%)"
+        of_kinds = bool(places) and not places[0].environments
+        kinds = places if of_kinds and len(places) <= len(TABLE1) else []
+        whole = replace(self.table(title, [*first, *kinds, *alarms], note), whole=True)
+        if not places:
+            return whole
+        shorter = (
+            replace(self.table(title, [*first, *alarms], note), whole=True) if kinds else whole
+        )
+        cells = [self._worst(entry, places) for entry in self.order]
+        heading = "worst anomaly" if of_kinds else WORST
+        for row, text in zip((shorter.header, *shorter.rows), (heading, *cells), strict=True):
+            row.insert(shorter.labels + 1, text)
+        return replace(whole, narrower=[shorter]) if kinds else shorter
+
+    @functools.cached_property
+    def _first(self) -> list[Column]:
+        """The metric that ranks; none where records leave it out."""
+        board, metric = self.board, self.board.ranking
+        lacking = board.leaves_out([metric]) if board.paired else not self._present([metric])
+        return [] if lacking else [Column(metric, _heading(metric), intervals=True)]
+
+    @functools.cached_property
+    def _alarms_first(self) -> list[Column]:
+        """The columns of guaranteed alarms that stand first everywhere."""
+        names = _OUTCOMES if self.board.ranking == OUTCOME else _FIRST
+        return self.columns(self._at_level(*names))
+
+    @functools.cached_property
+    def _places(self) -> list[Column]:
+        """The metric that ranks by environment, or of one environment by anomaly, if several."""
+        board, metric = self.board, self.board.ranking
+        environments = [e for e in board.environments if self._present([metric], [e])]
+        if len(environments) != 1:
+            return [Column(metric, e, [e]) for e in environments]
+        kinds = [k for k in board.anomalies if cells_with(metric, self._of(k))]
+        return [Column(metric, k, anomalies=[k]) for k in kinds] if len(kinds) > 1 else []
+
+    def essentials(self, facts: str = "") -> list[str]:
+        """Return what has to be known to read the headline, at most `MOST_NOTES` sentences.
+
+        Parameters
+        ----------
+        facts
+            What comes before all: of which part of a split the figures are.
+        """
+        metric, graded = self.board.ranking, _has_strengths(self.board)
+        notes = [
+            _joined(facts, "Means are over all strengths." * graded),
+            self._legend(),
+            self._promised(),
+            f"{metric_info(metric).title}: {_MEANINGS[metric]}; 50 is chance." * bool(self._first),
+            _FOUND * any(column.metric.startswith("missed") for column in self._alarms_first),
+        ]
+        return [f"{note[0].upper()}{note[1:]}" for note in notes if note][:MOST_NOTES]
+
+    def _legend(self) -> str:
+        """Return what the marks in the headline mean, in one sentence."""
+        board, columns = self.board, [*self._first, *self._places, *self._alarms_first]
+        cells = {text for entry in self.order for text in texts(board, entry, columns)}
+        undefined = ", ".join(_lacking(board, self.order, columns))
+        marks = {
+            "*": "over fewer cells than the split has",
+            BRIEF: "half of the episodes end within 20 rows",
+            UNDEFINED: undefined or "undefined",
+        }
+        legend = [f"{mark}: {text}" for mark, text in marks.items() if mark in "".join(cells)]
+        lacking = {text for r in board.records if (text := unpromised(r, self.suffix))}
+        legend += [f"{UNPROMISED}: {text}" for text in sorted(lacking)]
+        legend += [f"{SUPERVISED}: learns from failures"] * bool(board.supervised)
+        others = [r for r in board.records if r.training not in ("nominal", "failures")]
+        knowing = ", ".join(dict.fromkeys(str(r.setting) for r in others))
+        legend += [f"not ranked, for what they know: {knowing}"] * bool(knowing)
+        return f"{'; '.join(legend)}." if legend else ""
+
+    def _promised(self) -> str:
+        """Return what false episodes are, and what is promised of them, or why there are none."""
+        usual = self.level or catalogue.HEADLINE
+        if not self._alarms_first:
+            return _joined(*missing_level(self.board, usual))
+        if not any(r.ok and not unpromised(r, self.suffix) for r in self.board.records):
+            return f"{_FALSE}; no share of them is promised."
+        few = _lacking(self.board, self.order, [Column(f"false_episodes_{usual}")])
+        why = f" ({', '.join(few)})" * (self.suffix != usual)
+        return f"{_FALSE}; the threshold promises at most {percent_of(self.suffix)}{why}."
 
     def _of(self, anomaly: str) -> list[Record]:
         return [r for r in self.board.records if r.anomaly == anomaly]
 
-    def _worst(self, entry: Setting) -> str:
-        """Return the environment in which a row's mean is lowest, and that mean."""
-        worst = self.board.worst(entry)
-        return f"{worst[0]} {show_value(worst[1], self.board.ranking)}" if worst else ""
+    def _worst(self, entry: Setting, places: Iterable[Column]) -> str:
+        """Return the place in which a row's mean is lowest, and that mean."""
+        means = [(self.board.of(entry, column), column.title) for column in places]
+        defined = [mean for mean in means if not math.isnan(mean[0].value)]
+        value, name = min(defined, key=lambda mean: mean[0].value, default=(Value(), ""))
+        return f"{name} {show_value(value, self.board.ranking)}" if name else ""
 
     def _promise(self, columns: Iterable[Column]) -> str:
         """Return what a table of guaranteed alarms promises, and which level stands for another."""
@@ -325,28 +410,22 @@ class Tables:
         note = " ".join(reasons(board, [entry], itertools.chain(*cells.values())))
         title = f"{entry}: {info.title}{' (%)' * (info.unit == 'percent')} by anomaly"
         header = ["Environment", *board.anomalies]
-        return Table(title, header, rows, note=note, wrap=not board.paired)
+        return Table(title, header, rows, note=note)
 
-    def of_logs(self, *, whole: bool = False) -> list[Table]:
-        """Return the tables of a board without twins, the most important one first.
+    def of_logs(self) -> list[Table]:
+        """Return what a board without twins has beside its headline.
 
-        With `whole` there is more than the headline, and each of several environments has a table
-        of its own.
+        Each of several environments has a table of its own.
         """
         environments = self.board.environments
-        ranks = bool(self._present([self.board.ranking]))
-        candidates = [self.headline() if ranks else None]
-        if whole:
-            single = environments if len(environments) > 1 else []
-            candidates += [self._alarms(), self._outcomes(), self._nominal(), self._apart()]
-            candidates += [self._alarms([name]) for name in single]
-        elif not ranks:
-            candidates += [self._alarms(), self._nominal()]
-        elif self.board.ranking != OUTCOME:
-            candidates.append(self._outcomes())
-        if self._present(ROWS):
-            candidates.append(self._of_logs(_PUBLISHED, ROWS))
-        return [table for table in candidates if table]
+        single = environments if len(environments) > 1 else []
+        candidates = [self._alarms(), self._outcomes(), self._nominal(), self._apart()]
+        candidates += [self._alarms([name]) for name in single]
+        return [table for table in (*candidates, self.published()) if table]
+
+    def published(self) -> Table | None:
+        """Return metrics of rows as published tables have them; None when no record has any."""
+        return self._of_logs(_PUBLISHED, ROWS) if self._present(ROWS) else None
 
     def _alarms(self, environments: Sequence[str] = ()) -> Table | None:
         """Return separability and guaranteed alarms side by side; None without anomalous rows."""
@@ -461,12 +540,19 @@ class Tables:
         promises = dict.fromkeys(itertools.chain(*lacking))
         band = _BAND * any(e in self.board.supervised and e not in self.labels for e in rows)
         note = _joined(note, *promises, band, *reasons(self.board, rows, columns))
-        return Table(title, header, cells, len(self.label_names), note, wrap=not self.board.paired)
+        return Table(title, header, cells, len(self.label_names), note)
 
 
 _TABLE_5: Final = ("auc", "delay", "far")
 _FIRST: Final = (f"found_within_{catalogue.FOUND_WITHIN[0]}", "missed", "false_episodes")
 _OUTCOMES: Final = ("found_outcome", "balanced_outcome", "false_episodes")
+_FALSE: Final = "False episodes: nominal ones with an alarm"
+_FOUND: Final = "Found, missed: anomalous episodes with an alarm within 20 rows, and with none."
+_MEANINGS: Final = {
+    catalogue.RANKING: "how often a row scores higher under the anomaly",
+    POOLED[0]: "how often anomalous rows score above nominal ones",
+    OUTCOME: "how often a failure scores above a success",
+}
 _SAME_ROW: Final = "Episodes are compared up to the same row, as failures run into the time limit."
 _FIXED: Final = (
     "Detector seeds are fixed: intervals are over test episodes and calibration episodes, and say "
@@ -493,14 +579,12 @@ def by_group(board: Board, title: str) -> list[Column]:
 
 
 def best_first(board: Board) -> list[Setting]:
-    """Return the rows of a board by their mean of the metric that ranks them, the best first.
+    """Return the rows of a board by their mean of `ordering_metric`, the best first.
 
-    Where no record has it, as in some graded suites, the share that is found decides. Rows without
-    a value in some expected cell come last, and below them in the same order those that learn from
-    failures.
+    Rows without a value in some expected cell come last, and below them in the same order those
+    that learn from failures.
     """
-    share_found = f"found_within_{catalogue.FOUND_WITHIN[-1]}_{board.level}"
-    metric = share_found if board.leaves_out([board.ranking]) else board.ranking
+    metric = ordering_metric(board)
     means = {entry: board.of(entry, Column(metric)) for entry in board.entries}
 
     def order(entry: Setting) -> tuple[bool, bool, float, str]:
@@ -510,6 +594,15 @@ def best_first(board: Board) -> list[Setting]:
         return entry in board.supervised, undefined or mean.partial, value, str(entry)
 
     return sorted(means, key=order)
+
+
+def ordering_metric(board: Board) -> str:
+    """Return the metric that rows stand by: the one that ranks them.
+
+    Where no record has it, as in some graded suites, the share that is found decides.
+    """
+    share_found = f"found_within_{catalogue.FOUND_WITHIN[-1]}_{board.level}"
+    return share_found if board.leaves_out([board.ranking]) else board.ranking
 
 
 def _mean(board: Board, entry: Setting, columns: Sequence[Column]) -> Value:
@@ -716,8 +809,7 @@ def notes(board: Board) -> list[str]:
     if board.limit is not None:
         first = counted(board.limit, "trajector(y/ies)")
         lines.append(f"Limited to the first {first} of each part: for trying.")
-    cells = {(r.environment, r.anomaly, r.strength) for r in board.records}
-    if len(cells) > len({cell[:2] for cell in cells}):
+    if _has_strengths(board):
         lines.append(
             "Anomalies have several strengths: means are over all of them, but for columns that "
             "are named by strengths."
@@ -742,6 +834,12 @@ def notes(board: Board) -> list[str]:
         "over fewer cells than the split has there. A failure is shown as its state."
     )
     return lines
+
+
+def _has_strengths(board: Board) -> bool:
+    """Tell whether an anomaly of some environment has several strengths."""
+    cells = {(r.environment, r.anomaly, r.strength) for r in board.records}
+    return len(cells) > len({cell[:2] for cell in cells})
 
 
 def uncalibrated(board: Board) -> list[str]:

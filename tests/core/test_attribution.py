@@ -389,7 +389,8 @@ def test_a_failing_explanation_is_a_state_with_a_reason():
         assert not record.metrics
 
 
-def test_tables_have_a_section_for_detectors_that_explain(world, capsys):
+def test_tables_have_a_section_for_detectors_that_explain(world, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "250")
     home, _ = world
     show = ["show", str(home / "results"), "--stored"]
     assert main([*show, "--wide"]) == 0

@@ -356,12 +356,13 @@ def test_show_prints_what_the_run_printed(run, clock):
     printed = (clock.parent / "printed").read_text()
     code, shown, _ = run("show", clock)
     assert code == 0
-    tables = shown[: shown.index("Split tiny")]
-    assert "Matched AUC" in tables
+    assert "Matched AUC" in shown
     reason = "4 calibration episodes; 38 needed at 5 %"
-    assert f"Undefined for clock: guaranteed alarms at 5 % ({reason})." in " ".join(tables.split())
-    assert tables in printed
-    assert printed.count(tables.splitlines()[0]) == 1  # the verdict
+    assert f"Undefined for clock: guaranteed alarms at 5 % ({reason})." in " ".join(shown.split())
+    # What a run ends with is all that is shown.
+    tables, last, rest = shown.partition("everything else: oodd-eval show ")
+    assert f"\n\n{tables}{last}oodd-results --wide, oodd-results/report.md\n" in printed
+    assert rest.split() == [str(clock), "--wide,", str(clock / "report.md")]
     assert "All metrics" not in shown
     wide = run("show", clock, "--wide")[1]
     assert "All metrics" in wide

@@ -20,6 +20,7 @@ from oodd_eval.results.report import Report
 from oodd_eval.results.strengths import DETECTION, Strengths, StrengthTables, curve, thresholds
 from oodd_eval.results.tables import Tables
 
+FIGURES = ("metrics", "per_trajectory")
 NULL = "found_within_100_null_at_5pct"
 UNITS = {("ant", "iid"): 2.0, ("hopper", "iid"): 10.0, ("ant", "gravity"): 1.0}
 TIMES = {"4th": (1 / 4, math.nan), "kept99": (1, 0.99), "kept90": (4, 0.9), "kept50": (16, 0.5)}
@@ -182,7 +183,17 @@ def test_reports_and_the_terminal_have_the_tables_where_there_are_strengths():
     for title in ("Detection thresholds, lower is better", "Matched AUC (%) by strength",
                   "Detection thresholds by anomaly"):  # fmt: skip
         assert f"### {title}" in text
-        assert (title in shown.getvalue()) == title.endswith("better")
+        assert title not in shown.getvalue()
+    (section,) = Report(RECORDS, detail="brief").sections
+    assert section.tables[0].header[:2] == ["detector", "matched AUC"]
+    assert "all strengths" in section.notes[0]
+    # Where records keep the share that is found alone, thresholds are what there is.
+    kept = [
+        dataclasses.replace(r, **{n: {DETECTION: getattr(r, n)[DETECTION]} for n in FIGURES})
+        for r in RECORDS
+    ]
+    (section,) = Report(kept, detail="brief").sections
+    assert [t.title.partition(",")[0] for t in section.tables] == ["Detection thresholds"]
     assert "### rf: detection thresholds" in text
     bare = [make_record("rf", "ant", "iid", strength=name) for name in TIMES]
     tables = StrengthTables(Board(bare)).overview(places=True)

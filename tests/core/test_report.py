@@ -2,6 +2,7 @@
 
 import csv
 import io
+import itertools
 import json
 import math
 import re
@@ -17,6 +18,7 @@ from rich.console import Console
 
 from oodd_eval.cli.main import main
 from oodd_eval.cli.reporter import TerminalReporter
+from oodd_eval.data.facts import TABLE1
 from oodd_eval.metrics.bootstrap import bounds, drawn_cell, sample_cells
 from oodd_eval.metrics.catalogue import PAPER
 from oodd_eval.metrics.recalibration import PairedScores
@@ -28,7 +30,7 @@ from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.evaluate import Rules, cell_metrics
 from oodd_eval.results.render import FORMATS
 from oodd_eval.results.report import Report, findings_of
-from oodd_eval.results.standings import compare_rows, verdict_of
+from oodd_eval.results.standings import compare_rows, verdict_of, with_interval
 from oodd_eval.results.tables import Tables, why_undefined
 
 
@@ -71,7 +73,7 @@ def test_markdown_has_every_table_with_its_columns_and_numbers():
     text = rendered(example())
     tables = markdown_tables(text)
     assert text.startswith(
-        "# Results\n\n## Split mini\n\n**No difference is shown between riqn and"
+        "# Results\n\n## Split mini\n\n**riqn is first of four and cannot be told from"
     )
     assert "\n\nCells: 16, of which 14 ok and 2 failed.\n\n" in text
     assert len(tables) == len(TITLES)
@@ -369,20 +371,40 @@ def rows(metric="auc_matched", environment="cartpole", **values):
     return [make_record(d, environment, values={metric: v}) for d, v in values.items()]
 
 
-def test_the_verdict_names_the_better_row_and_by_how_much():
-    # All twelve episodes differ by a tenth, so that every resample does.
-    base = [0.5 + i / 100 for i in range(12)]
-    records = rows(mewma=base, rf=[v + 0.1 for v in base], clock=[0.5] * 12)
-    sentence = "rf beats mewma by 10.0 points [10.0, 10.0] in matched AUC on CartPole."
+def own(detector, environment="cartpole", **fields):
+    """One record of a row that oodd-eval does not ship."""
+    return replace(make_record(detector, environment, **fields), plugin="somebody:theirs")
+
+
+BASE = [0.5 + i / 100 for i in range(12)]  # of twelve episodes
+RAISED = [v + 0.1 for v in BASE]  # all differ by a tenth, so that every resample does
+
+
+def test_the_verdict_says_where_the_first_row_that_was_named_stands():
+    records = rows(mewma=BASE, rf=RAISED, clock=[0.5] * 12)
+    behind = "mewma is second of three, 10.0 points [10.0, 10.0] behind rf in matched AUC."
     (section,) = Report(records).sections
-    assert section.verdict == sentence
-    assert str(Report(records)).splitlines()[0] == sentence
-    for first, second in (("rf", "mewma"), ("mewma", "rf")):
-        assert compare_rows(records, first, second).verdict == sentence
-    both = [*records, *rows(environment="ant", mewma=base, rf=[v + 0.3 for v in base])]
-    (section,) = Report([r for r in both if r.detector != "clock"]).sections
-    assert section.verdict.startswith("rf beats mewma by 20.0 points [")
-    assert section.verdict.endswith("] in matched AUC on CartPole and Ant.")
+    assert section.verdict == behind
+    assert str(Report(records)).splitlines()[0] == behind
+    ahead = "rf is first of three, 10.0 points [10.0, 10.0] ahead of mewma in matched AUC."
+    assert verdict_of(Board([records[1], records[0], records[2]])) == ahead
+    last = verdict_of(Board(records[::-1]))
+    assert last.startswith("clock is third of three, 15.5 points [")
+    assert last.endswith("] behind rf in matched AUC.")
+    many = [make_record(f"row{i:02}", values={"auc_matched": [i / 20] * 12}) for i in range(13)]
+    assert verdict_of(Board(many)).startswith("row00 is 13th of 13, 60.0 points [")
+
+
+@pytest.mark.parametrize("plugin", ["mine:mine", "local:", "oodd-eval:adapters"])
+def test_the_verdict_is_about_the_row_that_is_not_shipped(plugin):
+    """One of another distribution, a class of a script, or what an adapter makes."""
+    name = "sklearn:Ridge" if plugin.startswith("oodd-eval") else "jumps"
+    theirs = replace(rows(**{name: [0.55] * 12})[0], plugin=plugin)
+    records = [*rows(mewma=BASE, rf=RAISED), theirs]
+    assert verdict_of(Board(records)).startswith(f"{name} is third of three")
+    # Of several the best.
+    other = replace(rows(other=[0.9] * 12)[0], plugin="mine:mine")
+    assert verdict_of(Board([*records, other])).startswith("other is first of four")
 
 
 def test_the_verdict_has_the_numbers_of_the_comparison():
@@ -390,14 +412,23 @@ def test_the_verdict_has_the_numbers_of_the_comparison():
     compared = compare_rows(records := rows(**values), "mewma", "rf")
     assert compared.difference < 0
     ends = f"{-100 * compared.high:.1f}, {-100 * compared.low:.1f}"
-    amount = f"{-100 * compared.difference:.1f}"
-    expected = f"rf beats mewma by {amount} points [{ends}] in matched AUC on CartPole."
-    assert verdict_of(Board(records)) == compared.verdict == expected
+    amount = f"{-100 * compared.difference:.1f} points [{ends}]"
+    assert amount == compared.amount
+    assert verdict_of(Board(records)) == (
+        f"mewma is second of two, {amount} behind rf in matched AUC."
+    )
+    assert compared.verdict == f"rf beats mewma by {amount} in matched AUC on CartPole."
+    for first, second in (("rf", "mewma"), ("mewma", "rf")):
+        assert compare_rows(records, first, second).verdict == compared.verdict
     # Where lower is better, the row with the smaller mean is.
     steps = {d: [10 * v for v in of_row] for d, of_row in values.items()}
     sooner = compare_rows(rows("delay_censored_at_5pct", **steps), *steps, "delay_censored_at_5pct")
     assert sooner.verdict.startswith("mewma beats rf by 1.4 steps [0.")
     assert sooner.verdict.endswith("] in delay censored at 5 % on CartPole.")
+    both = [*rows(mewma=BASE, rf=RAISED), *rows(environment="ant", mewma=BASE, rf=RAISED)]
+    assert compare_rows(both, "rf", "mewma").verdict.endswith(
+        "] in matched AUC on CartPole and Ant."
+    )
 
 
 def test_no_difference_is_shown_where_the_interval_includes_zero():
@@ -405,39 +436,65 @@ def test_no_difference_is_shown_where_the_interval_includes_zero():
     records = rows(mewma=[0.6, 0.7] * 6, rf=[0.7, 0.6] * 6)
     compared = compare_rows(records, "rf", "mewma")
     assert compared.low < 0 < compared.high
-    text = verdict_of(Board(records))
-    assert text.startswith("No difference is shown between mewma and rf in matched AUC on CartPole")
     ends = f"[-{100 * compared.high:.1f}, {100 * compared.high:.1f}]"
-    assert text.endswith(f": 0.0 points {ends}, p = 1.")
+    assert verdict_of(Board(records)).startswith(
+        f"mewma is first of two and cannot be told from rf: 0.0 points {ends}"
+    )
+    assert compared.verdict.startswith("No difference is shown between rf and mewma in matched")
+    assert compared.verdict.endswith(f": 0.0 points {ends}, p = 1.")
     assert str(compared).count("p = ") == 1
     # Four test seeds are too few for any verdict: the interval has no ends.
     few = compare_rows(rows(mewma=[0.5] * 4, rf=[0.7] * 4), "rf", "mewma")
     assert few.verdict.startswith("No difference is shown between rf and mewma")
-    assert "20.0 points [\N{EN DASH}, \N{EN DASH}], p = 0.12." in few.verdict
+    assert "20.0 points (no interval: too few test episodes), p = 0.12." in few.verdict
+
+
+@given(
+    st.floats(-0.01, 0.01), st.floats(0, 0.02), st.floats(0, 0.02), st.sampled_from(["auc", "far"])
+)
+def test_an_interval_and_its_verdict_never_contradict_each_other(middle, below, above, metric):
+    """As printed, the interval leaves out 0 just where the rows are told apart."""
+    low, high = middle - below, middle + above
+    text = with_interval(middle, low, high, metric)
+    ends = [float(end) for end in re.search(r"\[(.*), (.*)\]", text).groups()]
+    told = low > 0 or high < 0
+    least = min(abs(low), abs(high)) * (100 if metric == "auc" else 1)
+    if told and least >= 0.00005:
+        assert ends[0] > 0 or ends[1] < 0
+    if not told:
+        assert ends[0] <= 0 <= ends[1]
 
 
 def test_the_verdict_on_one_row_is_its_headline_in_words():
-    values = {
-        "auc_matched": [0.8, 0.9],
-        "missed_at_5pct": [0, 1],
-        "delay_censored_at_5pct": [4, 36],
-    }
+    values = {"auc_matched": [0.8, 0.9], "missed_at_5pct": [0, 1]}
     board = Board([make_record(values=values | {"false_episodes_at_5pct": [0, 0]})])
     assert verdict_of(board) == (
-        "riqn on Hopper: matched AUC 85.0 %; with alarms in at most 5 % of nominal episodes: delay "
-        "censored 20.0 steps, missed 50.0 %, false episodes 0.0 %."
+        "riqn on Hopper: matched AUC 85.0 %, missed 50.0 %, false episodes 0.0 %."
     )
     assert verdict_of(Board([make_record(status="oom")])) == ""
 
 
-def test_rows_that_failed_or_know_more_than_nominal_episodes_are_no_second_best():
+def test_rows_that_failed_or_know_more_than_nominal_episodes_are_no_rivals():
     values = {"mewma": [0.5] * 12, "rf": [0.6] * 12}
     oracle = make_record(
         "oracle", "cartpole", values={"auc_matched": [0.9] * 12}, training="oracle"
     )
     failed = make_record("pe", "cartpole", status="timeout")
-    text = verdict_of(Board([oracle, failed, *rows(**values)]))
-    assert text.startswith("rf beats mewma by 10.0 points")
+    text = verdict_of(Board([*rows(**values), oracle, failed]))
+    assert text.startswith("mewma is second of three ranked rows, 10.0 points")
+    assert text.endswith("behind rf in matched AUC.")
+    # A row that failed has no place.
+    theirs = own("jumps", status="error", reason="no mood")
+    text = verdict_of(Board([*rows(**values), theirs, own("jumps", anomaly="drift")]))
+    assert text.startswith("jumps has no place: error in 1 of 2 cells")
+    # One that lacks a cell is compared over what both have, and said to be.
+    more = [*rows(**values), *(r for d in values for r in [make_record(d, "ant", values=FLAT)])]
+    text = verdict_of(Board([*more, own("jumps", values={"auc_matched": [0.9] * 12})]))
+    assert text.startswith("jumps is third of three, 30.0 points [")
+    assert text.endswith("] ahead of rf in matched AUC, over the 1 cell that both have.")
+
+
+FLAT = {"auc_matched": [0.5] * 12}
 
 
 # Figures that are undefined
@@ -464,6 +521,8 @@ def test_a_level_that_calibration_episodes_are_too_few_for_is_named():
     assert ("at 10 %" in chosen.title, "calibration" in chosen.note) == (True, False)
     (section,) = Report([strict], level="at_1pct", detail="brief").sections
     assert not [t for t in section.tables if "Guaranteed" in t.title]
+    assert any("pe: guaranteed alarms at 1 % (40" in text for text in section.notes)
+    (section,) = Report([strict], level="at_1pct").sections
     assert any("pe: guaranteed alarms at 1 % (40" in text for text in section.findings)
     # Without any level there is no table, and the report says why.
     none = replace(calibrated("rf", 17), metrics={}, per_trajectory={})
@@ -549,9 +608,9 @@ def test_piped_output_has_no_escapes_and_fits_80_columns():
     assert "\x1b" not in text
     assert max(map(len, text.splitlines())) <= 80
     assert "TIMEOUT ant/rf[h=1,seed=0]: not done after 5 s (--timeout)" in text
-    order = [text.index(t) for t in ("No difference is", "Matched AUC and guaranteed alarms")]
+    order = [text.index(t) for t in ("riqn is first of", "Matched AUC and guaranteed alarms")]
     assert order == sorted(order)
-    assert order[0] == 0
+    assert not text[: order[0]].strip()
     assert PAPER not in text
     one = TerminalReporter(console(), paper=True)
     one.tables(example())
@@ -561,19 +620,91 @@ def test_piped_output_has_no_escapes_and_fits_80_columns():
     assert "\x1b[31m" in printed(screen)
 
 
-WIDE = Table("t", [f"column {i}" for i in range(8)], [[str(i) for i in range(8)]])
+WIDE = [f"column {i}" for i in range(8)]
 
 
-def test_a_table_that_is_too_wide_is_turned_or_comes_in_parts_with_its_labels():
-    lines = printed_table(WIDE, 40)
+@pytest.mark.parametrize("rows", [1, 9])
+def test_a_table_that_is_too_wide_comes_in_parts_with_its_labels(rows):
+    texts = [[f"row {i}", *map(str, range(123456, 123463))] for i in range(rows)]
+    lines = printed_table(Table("t", WIDE, texts), 40)
     assert max(map(len, lines)) <= 40
-    assert len(lines) == 11
-    rows = [[f"row {i}", *map(str, range(7))] for i in range(9)]
-    lines = printed_table(Table("t", WIDE.header, rows), 40)
-    assert max(map(len, lines)) <= 40
-    headers = [line.split("  ") for line in lines if line.startswith("column 0")]
-    assert len(headers) > 1
-    assert [w.strip() for h in headers for w in h[1:] if w] == WIDE.header[1:]
+    rules = [line.split() for line in lines if line.startswith("---")]
+    assert len(rules) > 1
+    assert sum(len(rule) - 1 for rule in rules) == len(WIDE) - 1
+    for i in range(rows):
+        assert sum(line.startswith(f"row {i}") for line in lines) == len(rules)
+
+
+def five_columns(kinds=("iid",), environments=("ant", "lunarlander"), names=("persistence", "rf")):
+    """Rows with all five columns, whose intervals are wide."""
+    values = ALARMS | {"auc_matched": [0.123, 0.987], "missed_at_5pct": [0, 0]}
+    return [make_record(d, e, a, values=values) for d in names for e in environments for a in kinds]
+
+
+EIGHT = [*TABLE1]
+
+
+@pytest.mark.parametrize(
+    ("records", "width", "columns", "intervals"),
+    [
+        (five_columns(), 120, ["worst environment"], 2),
+        (five_columns(names=["mewma", "rf"]), 80, ["worst environment"], 2),
+        (five_columns(), 80, ["worst environment"], 1),
+        (five_columns(), 60, ["worst environment"], 0),
+        (five_columns(EIGHT, ["hopper"], ["mewma"]), 150, EIGHT, 2),
+        (five_columns(EIGHT, ["hopper"], ["mewma"]), 120, EIGHT, 2),
+        (five_columns(EIGHT, ["hopper"], ["mewma"]), 80, ["worst anomaly"], 2),
+        (five_columns(["iid", "drift"], ["hopper"]), 80, ["iid", "drift"], 2),
+        (five_columns(["iid"], ["hopper"]), 80, [], 2),
+    ],
+)
+def test_the_headline_is_one_table_whose_rows_are_detectors(records, width, columns, intervals):
+    """Headings are of several lines where they must be, and intervals are the last to go."""
+    table = Tables(Board(records)).headline()
+    title, *lines = printed_table(replace(table, note=""), width)
+    assert title == table.title
+    assert max(map(len, lines)) <= width
+    rule = next(i for i, line in enumerate(lines) if line.startswith("---"))
+    ends = itertools.accumulate(len(dashes) + 2 for dashes in lines[rule].split("  "))
+    starts = [0, *ends]
+    headings = [
+        "".join(line[i:j].strip() + "/" for line in lines[:rule]).rstrip("/")
+        for i, j in itertools.pairwise(starts)
+    ]
+    flat = [re.sub("-/+", "", h).replace("/", " ").replace("- ", "") for h in headings]
+    expected = ["detector", "matched AUC", *columns, "found within 20", "missed", "false episodes"]
+    assert [re.sub("[^a-zA-Z0-9]", "", h) for h in flat] == [
+        re.sub("[^a-zA-Z0-9]", "", h) for h in expected
+    ]
+    rows = [line for line in lines[rule + 1 :] if line]
+    assert [row.split()[0] for row in rows] == [str(s) for s in Board(records).entries]
+    assert all(row.count("[") == intervals for row in rows)
+
+
+def test_a_run_ends_with_one_table_and_at_most_three_notes():
+    several = [
+        *example(),
+        make_record("oracle", "ant", limit=None, training="oracle"),
+        make_record("pe", "cartpole", values={"delay_at_5pct": [None, None]}),
+    ]
+    for records in (example(), several, [replace(r, limit=3) for r in several], five_columns()):
+        (section,) = Report(records, detail="brief").sections
+        assert len(section.tables) == 1
+        assert not section.tables[0].note
+        assert not section.findings
+        assert 1 <= len(section.notes) <= 3
+    (section,) = Report([replace(r, limit=3) for r in several], detail="brief").sections
+    assert "limit 3" in section.notes[0]
+    assert "*: " in section.notes[1]
+    assert "oracle" in section.notes[1]
+    # All of it is in the report of the run.
+    text = rendered(several)
+    assert "has a higher mean" in text
+    assert "Undefined for" in text
+    assert "FAR" in text
+    wide = Report(several, detail="wide").sections[0]
+    assert len(wide.tables) > 3
+    assert wide.findings
 
 
 def test_names_of_others_are_not_taken_for_markup():
