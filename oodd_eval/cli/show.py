@@ -28,7 +28,7 @@ from oodd_eval.errors import UsageError
 from oodd_eval.metrics.alarms import RECORDED, STATISTICS
 from oodd_eval.metrics.catalogue import NAMES
 from oodd_eval.names import check_known, expression, select
-from oodd_eval.prose import print_prose, print_sections
+from oodd_eval.prose import print_sections
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.evaluate import rescore
 from oodd_eval.results.record import Record
