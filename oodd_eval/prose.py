@@ -123,87 +123,86 @@ def print_table(table: Table, console: Console, width: int = 0) -> None:
     """Print one table within a width, by default the console's, its rows as rows."""
     print_prose(table.title, console, "bold")
     for part in _fitting(table, width or console.width):
-        header, *rows = _aligned(part)
-        rule = "  ".join("-" * n for n in _widths(part))
-        colours = [*part.colours] or [""] * len(rows)
-        console.print(Text("\n".join([*header, rule])))
-        for lines, colour in zip(rows, colours, strict=True):
-            console.print(Text("\n".join(lines), colour))
+        rows = [part.header, *part.rows]
+        colours = ["", "", *(part.colours or [""] * len(part.rows))]
+        lines = iter(_lines_of(part))
+        for n, colour in zip([_height(rows[0]), 1, *map(_height, rows[1:])], colours, strict=True):
+            console.print(Text("\n".join(itertools.islice(lines, n)), colour))
         console.print("")
     if table.note:
         print_prose(table.note + "\n", console, "dim")
 
 
+def _height(row: Sequence[str]) -> int:
+    return 1 + max(text.count("\n") for text in row)
+
+
+def _lines_of(table: Table) -> list[str]:
+    """Return the lines of a table with a rule below its header, no column wider than its texts."""
+    texts = [table.header, *table.rows]
+    layout: dict[str, Any] = {"colalign": table.alignment, "disable_numparse": True}
+    rule, *lines, _ = tabulate(texts, tablefmt="simple", **layout).splitlines()
+    n = _height(table.header)
+    return [line.rstrip() for line in (*lines[:n], rule, *lines[n:])]
+
+
 def _fitting(table: Table, width: int) -> list[Table]:
     """Return what of a table fits: its first shape that does, or parts of its columns."""
     shapes = [table, *table.narrower]
-    for column in reversed(range(table.labels, len(table.header)) if table.whole else ()):
+    for i in reversed(range(table.labels, len(table.header)) if table.whole else ()):
         bare = [
-            [_bare(text) if i == column else text for i, text in enumerate(row)]
-            for row in shapes[-1].rows
+            [*r[:i], *(_INTERVAL.sub("", text) for text in r[i : i + 1]), *r[i + 1 :]]
+            for r in shapes[-1].rows
         ]
-        shapes += [replace(shapes[-1], rows=bare)] * (bare != shapes[-1].rows)
-    for shape in shapes:
-        for candidate in (shape, *(_wrapped(shape, width, room) for room in _ROOMS)):
-            if _width(candidate) <= width:
-                return [candidate]
-    if table.whole:
-        return [candidate]
-    labels = list(range(table.labels))
-    parts = [labels]
-    for column in range(table.labels, len(table.header)):
+        shapes.append(replace(shapes[-1], rows=bare))
+    for shape in itertools.chain(*((shape, _wrapped(shape, width)) for shape in shapes)):
+        if _width(shape) <= width:
+            return [shape]
+    parts = [[*range(shape.labels)]]
+    for column in range(shape.labels, len(shape.header)):
         wider = [*parts[-1], column]
-        if parts[-1] == labels or _width(candidate.columns(wider)) <= width:
+        if shape.whole or len(wider) == shape.labels + 1 or _width(shape.columns(wider)) <= width:
             parts[-1] = wider
         else:
-            parts.append([*labels, column])
-    return [candidate.columns(part) for part in parts]
+            parts.append([*range(shape.labels), column])
+    return [shape.columns(part) for part in parts]
 
 
-def _bare(text: str) -> str:
-    """Return a figure without its interval."""
-    return _INTERVAL.sub("", text)
-
-
-def _wrapped(table: Table, width: int, room: int) -> Table:
+def _wrapped(table: Table, width: int) -> Table:
     """Return a table whose headings and labels take several lines where they are long.
 
-    Words of headings are divided where they are wider than the column's figures and the room.
+    Words of headings are divided where they are wider than the column's figures and `_NARROW`.
     """
     columns = [[row[i] for row in table.rows] for i in range(len(table.header))]
-    figures = [max(map(len, column), default=0) for column in columns]
-    header = [
-        _lines(text, width // 3 if i < table.labels else max(figures[i], room))
-        for i, text in enumerate(table.header)
+    room = [max(11 if i < table.labels else _NARROW, *map(len, c)) for i, c in enumerate(columns)]
+    header = [_lines(text, n) for text, n in zip(table.header, room, strict=True)]
+    sizes = [
+        max(map(len, "\n".join([h, *c]).split("\n"))) for h, c in zip(header, columns, strict=True)
     ]
-    wide = [max(w, *map(len, h.split("\n"))) for w, h in zip(figures, header, strict=True)]
-    for i in sorted(range(table.labels), key=wide.__getitem__, reverse=True):
+    for i in sorted(range(table.labels), key=sizes.__getitem__, reverse=True):
         # Of a whole table labels get what other columns leave, but no word is divided for them.
         pieces = [len(piece) for text in columns[i] for piece in _PARTS.split(text) if piece]
-        left = width - sum(wide) + wide[i] - 2 * (len(wide) - 1)
+        left = width - sum(sizes) + sizes[i] - 2 * (len(sizes) - 1)
         least = min(max(pieces, default=0), width // 3)
-        wide[i] = min(wide[i], max(left, least) if table.whole else width // 3)
-        columns[i] = [_lines(text, wide[i]) for text in columns[i]]
+        sizes[i] = min(sizes[i], max(left, least) if table.whole else width // 3)
+        columns[i] = [_lines(text, sizes[i]) for text in columns[i]]
     return replace(table, header=header, rows=[[*row] for row in zip(*columns, strict=True)])
 
 
 def _lines(text: str, room: int) -> str:
-    """Return text in lines of a room; longer words are divided, those of letters with a hyphen."""
-    wrapper = textwrap.TextWrapper(max(room, 1))
+    """Return text in lines of a room; longer words are divided evenly, with hyphens."""
+
+    def divided(word: re.Match[str]) -> str:
+        n = math.ceil(len(word[0]) / (room - 1)) if len(word[0]) > room else 1
+        return "-".join(textwrap.wrap(word[0], math.ceil(len(word[0]) / n)))
+
+    wrapper = textwrap.TextWrapper(room)
     wrapper.wordsep_re = _PARTS
-    return "\n".join(wrapper.wrap(_WORD.sub(lambda word: _divided(word[0], room), text)))
+    return "\n".join(wrapper.wrap(_WORD.sub(divided, text)))
 
 
-def _divided(word: str, room: int) -> str:
-    """Return a word that is too long for a room with hyphens between even parts of it."""
-    if len(word) <= room or room < _ROOMS[-1]:
-        return word
-    size = math.ceil(len(word) / math.ceil(len(word) / (room - 1)))
-    return "-".join(word[i : i + size] for i in range(0, len(word), size))
-
-
-_ROOMS: Final = (11, 6)
-"""Widths of columns that headings are wrapped to where figures are narrower, as tried."""
+_NARROW: Final = 6
+"""Width of a column that headings are wrapped to where its figures are narrower."""
 
 _PARTS: Final = re.compile(r"(\s+)|(?<=[-\[,:.=])(?=[^-\[,:.=\s])|(?<=[a-z])(?=[A-Z])")
 """Ends of lines are between words, and in names behind what separates their parts."""
@@ -213,30 +212,5 @@ _WORD: Final = re.compile(r"[^\W\d_]+")
 _INTERVAL: Final = re.compile(r" \[[^\]]*\]")
 
 
-def _widths(table: Table) -> list[int]:
-    lines = zip(table.header, *table.rows, strict=True)
-    return [max(len(line) for text in column for line in text.split("\n")) for column in lines]
-
-
 def _width(table: Table) -> int:
-    return sum(_widths(table)) + 2 * (len(table.header) - 1)
-
-
-def _aligned(table: Table) -> list[list[str]]:
-    """Return the lines of the header and of every row, columns two spaces apart."""
-    widths, lines = _widths(table), []
-    for row in (table.header, *table.rows):
-        columns = [
-            [line.ljust(n) if i < table.labels else line.rjust(n) for line in text.split("\n")]
-            for i, (text, n) in enumerate(zip(row, widths, strict=True))
-        ]
-        parts = itertools.zip_longest(*columns)
-        lines.append(
-            [
-                "  ".join(
-                    " " * n if text is None else text for text, n in zip(part, widths, strict=True)
-                ).rstrip()
-                for part in parts
-            ]
-        )
-    return lines
+    return max(map(len, _lines_of(table)))

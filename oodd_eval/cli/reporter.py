@@ -4,7 +4,7 @@ import math
 import shlex
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -21,7 +21,6 @@ from oodd_eval.results.board import boards, level_of, ranked_by
 from oodd_eval.results.directory import REPORT
 from oodd_eval.results.record import STATUSES, Record
 from oodd_eval.results.report import Report
-from oodd_eval.results.strengths import NO_UNITS
 from oodd_eval.scoring.display import Display
 from oodd_eval.scoring.plan import Plan
 
@@ -35,24 +34,13 @@ class TerminalReporter(Display):
 
     What runs is shown between the lines, but for a negative verbosity.
     `verbosity` -1 prints the summary only; 1, a line per cell and, from `log`, why fits failed.
-    `units` are those of strengths by kind of anomaly. `level` and `paper` are those of a `Report`.
     """
 
     def __init__(
-        self,
-        console: Console,
-        *,
-        verbosity: int = 0,
-        intervals: bool = False,
-        log: Callable[[str], Path] | None = None,
-        units: Mapping[str, str] = NO_UNITS,
-        level: str = "",
-        paper: bool = False,
+        self, console: Console, *, verbosity: int = 0, log: Callable[[str], Path] | None = None
     ) -> None:
         super().__init__(console)
-        self.verbosity, self.intervals = verbosity, intervals
-        self._log, self._units = log, units
-        self._level, self._paper = level, paper
+        self.verbosity, self._log = verbosity, log
         self._start = time.perf_counter()
         self._open: dict[tuple[str, str], list[Record]] = {}
         self._resumed = 0
@@ -95,19 +83,6 @@ class TerminalReporter(Display):
         end = ", interrupted" if interrupted else ""
         self.line(f"{summary(records)}{earlier} in {seconds:.1f} s{end}")
 
-    def tables(self, records: Sequence[Record]) -> None:
-        """Print where the reader's row stands and one table, for every board of some records."""
-        report = Report(
-            records,
-            intervals=self.intervals,
-            detail="brief",
-            units=self._units,
-            level=self._level,
-            paper=self._paper,
-        )
-        self.line("")
-        print_sections(report.sections, self.console)
-
     def failures(self, records: Sequence[Record]) -> None:
         """Print why fits failed."""
         for record in (record for board in boards(records) for record in board.failures()):
@@ -143,6 +118,14 @@ def rest(path: Path) -> str:
     file = path / REPORT
     more = f", {file}" * file.is_file()
     return f"everything else: oodd-eval show {shlex.quote(str(path))} --wide{more}"
+
+
+def print_report(report: Report, console: Console, path: Path) -> None:
+    """Print a report of results in a directory, and where all is that a brief one leaves out."""
+    print_sections(report.sections, console)
+    if report.detail == "brief" and not report.detector:
+        more = f", {path / REPORT}" * (path / REPORT).is_file()
+        console.print(f"everything else: oodd-eval show {shlex.quote(str(path))} --wide{more}")
 
 
 def summary(records: Sequence[Record]) -> str:

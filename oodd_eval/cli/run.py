@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -31,7 +32,7 @@ from oodd_eval.cli import (
 )
 from oodd_eval.cli.console import make_console
 from oodd_eval.cli.plugins import discovered
-from oodd_eval.cli.reporter import TerminalReporter, rest
+from oodd_eval.cli.reporter import TerminalReporter, print_report
 from oodd_eval.data.bounded import read_toml
 from oodd_eval.data.files import write_text
 from oodd_eval.data.layout import log_facts
@@ -161,34 +162,22 @@ def run(options: Options) -> int:
         row_metrics=options.row_metrics,
     )
     results = ResultsDirectory(options.output)
-    reporter = TerminalReporter(
-        console,
-        verbosity=options.verbosity,
-        intervals=options.intervals,
-        log=results.log_path,
-        units=split.units,
-        level=options.level,
-        paper=options.paper,
-    )
+    reporter = TerminalReporter(console, verbosity=options.verbosity, log=results.log_path)
     doubts = _Doubts(make_console(quiet=options.verbosity < 0), split)
     with reporter:
         done = run_plan(plan, split, plugins, settings, results, observers=[reporter, doubts])
     doubts.print(doubts_after(plan, split, results))
     say_notes(results.notes)
     if done.records:
-        records = results.records()
+        records, path = results.records(), results.path
+        settings = {name: getattr(options, name) for name in ("intervals", "level", "paper")}
         report = Report(
-            records,
-            intervals=options.intervals,
-            units=split.units,
-            level=options.level,
-            remarks=[*costly_voices(records, results)],
+            records, **settings, units=split.units, remarks=[*costly_voices(records, results)]
         )
-        write_text(results.path / REPORT, FORMATS["markdown"].render(report))
-        if options.verbosity >= 0:
-            if any(record.ok for record in done.records):
-                reporter.tables(done.records)
-            console.print(rest(results.path))
+        write_text(path / REPORT, FORMATS["markdown"].render(report))
+        if options.verbosity >= 0 and any(record.ok for record in done.records):
+            console.print("")
+            print_report(replace(report, records=done.records, detail="brief"), console, path)
     if left := _left(plan, done, fresh=options.fresh):
         console.print(left)
     if done.interrupted:

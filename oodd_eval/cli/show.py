@@ -21,14 +21,13 @@ from oodd_eval.cli import (
     together,
 )
 from oodd_eval.cli.console import make_console
-from oodd_eval.cli.reporter import TerminalReporter, rest, summary
+from oodd_eval.cli.reporter import TerminalReporter, print_report, summary
 from oodd_eval.data.facts import ENVIRONMENTS, in_order
 from oodd_eval.data.split import Split, load_split, split_directories
 from oodd_eval.errors import UsageError
 from oodd_eval.metrics.alarms import RECORDED, STATISTICS
 from oodd_eval.metrics.catalogue import NAMES
 from oodd_eval.names import check_known, expression, select
-from oodd_eval.prose import print_sections
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.evaluate import rescore
 from oodd_eval.results.record import Record
@@ -136,9 +135,7 @@ def show(options: Options) -> int:
         reporter.failures(records)
         if code:
             reporter.console.print(f"{summary(records)}\n")
-    print_sections(report.sections, reporter.console)
-    if report.detail == "brief" and not options.detector:
-        reporter.console.print(rest(options.directory))
+    print_report(report, reporter.console, options.directory)
     return code
 
 

@@ -281,7 +281,9 @@ def verdict_of(board: Board, level: str = "") -> str:
         return _in_words(board, own, level or board.level)
     i = band.index(own)
     rival = band[0] if i else band[1]
-    place = f"{own} is {_ordinal(i + 1)} of {_number(len(band))}"
+    n = len(band)
+    many = f"number {i + 1} of {n}"
+    place = f"{own} is {many if n > len(_PLACES) else f'{_PLACES[i]} of {_NUMBERS[n - 1]}'}"
     if len(board.entries) > len(band):
         place += f" {'rows that learn from failures' if own in board.supervised else 'ranked rows'}"
     means = [board.of(row, Column(metric)) for row in (own, rival)]
@@ -303,18 +305,7 @@ def verdict_of(board: Board, level: str = "") -> str:
     return f"{place} and cannot be told from {rival}: {test.amount} {ahead} it{scope}."
 
 
-def _number(n: int) -> str:
-    return _NUMBERS[n - 1] if n <= len(_NUMBERS) else str(n)
-
-
-def _ordinal(n: int) -> str:
-    if n <= len(_ORDINALS):
-        return _ORDINALS[n - 1]
-    teen = n % 100 in (11, 12, 13)
-    return f"{n}{'th' if teen else {1: 'st', 2: 'nd', 3: 'rd'}.get(n % 10, 'th')}"
-
-
-_ORDINALS: Final = (
+_PLACES: Final = (
     *("first", "second", "third", "fourth", "fifth"),
     *("sixth", "seventh", "eighth", "ninth", "tenth"),
 )

@@ -13,7 +13,6 @@ from oodd_eval.metrics.catalogue import (
     HEADLINE,
     INTERVENTIONS,
     LEVELS,
-    METRICS,
     NAMES,
     RANKING,
     UNDEFINED,

@@ -8,10 +8,10 @@ import pytest
 from helpers_records import example, make_record
 from rich.console import Console
 
-from oodd_eval.cli.reporter import TerminalReporter
 from oodd_eval.data.condition import Rung
 from oodd_eval.errors import SplitError
 from oodd_eval.metrics.catalogue import UNDEFINED
+from oodd_eval.prose import print_sections
 from oodd_eval.results import strengths as of_records
 from oodd_eval.results.board import Board
 from oodd_eval.results.collection import Results
@@ -179,7 +179,7 @@ def test_reports_and_the_terminal_have_the_tables_where_there_are_strengths():
     assert "strength" not in FORMATS["markdown"].render(Report(example()))
     text = FORMATS["markdown"].render(Report(RECORDS))
     shown = io.StringIO()
-    TerminalReporter(Console(file=shown, width=100)).tables(RECORDS)
+    print_sections(Report(RECORDS, detail="brief").sections, Console(file=shown, width=100))
     for title in ("Detection thresholds, lower is better", "Matched AUC (%) by strength",
                   "Detection thresholds by anomaly"):  # fmt: skip
         assert f"### {title}" in text
