@@ -16,7 +16,7 @@ import click
 from click.core import ParameterSource
 from click.shell_completion import CompletionItem
 
-from oodd_eval.errors import MissingExtraError, OoddError, UnknownNameError, UsageError
+from oodd_eval.errors import OoddError, UnknownNameError, UsageError
 from oodd_eval.metrics.catalogue import LEVELS
 from oodd_eval.names import memory_bytes, parameter, read, seconds, whole_numbers
 
@@ -55,8 +55,6 @@ class Command(click.Command):
         Options and arguments.
     examples
         Arguments of oodd-eval that the help shows.
-    repeated
-        Options that may have several words behind them, each of which is a value.
     further
         Options that ``--help`` leaves out, by the headings that ``--help-all`` has them under.
     """
@@ -66,30 +64,25 @@ class Command(click.Command):
         handler: Handler,
         params: list[click.Parameter],
         examples: Sequence[str],
-        repeated: Sequence[str],
         further: Mapping[str, str],
     ) -> None:
         settings = {"show_default": True}
         self.further = {name: head for head, names in further.items() for name in names.split()}
-        self._help_all = [_help_all(len(self.further))] if further else []
+        text = f"Show {len(self.further)} more options and exit."
+        self._help_all = click.Option(["--help-all"], is_flag=True, expose_value=False, help=text)
         super().__init__(None, settings, params=params, help=getdoc(handler))
-        self.handler, self.examples, self._repeated = handler, examples, repeated
+        self.handler, self.examples = handler, examples
 
     def get_params(self, ctx: click.Context) -> list[click.Parameter]:
         """Return options and arguments, with those that print a help text."""
         *params, help_option = super().get_params(ctx)
-        return [*params, *self._help_all, help_option]
+        return [*params, *[self._help_all][: len(self.further)], help_option]
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Read the arguments, with ``--records a b`` as ``--records=a --records=b``."""
-        words, option = [], ""
-        for word, following in zip(args, [*args, "-"][1:], strict=True):
-            if word in self._repeated and not following.startswith("-"):
-                option = word
-                continue
-            option = "" if word.startswith("-") else option
-            words.append(f"{option}={word}" if option else word)
-        return super().parse_args(ctx, words)
+        """Read the arguments; ``--help-all`` prints the help with the further options."""
+        if self.further and "--help-all" in args:
+            args, ctx.meta[ALL] = ["--help"], True
+        return super().parse_args(ctx, args)
 
     def invoke(self, ctx: click.Context) -> int:
         """Run the command and return its exit code; an output that is an input is refused."""
@@ -116,18 +109,16 @@ class Command(click.Command):
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write arguments and options; the further ones where the context asks for all."""
-        shown: dict[str, list[tuple[str, str]]] = {"Positional arguments": [], "Options": []}
-        shown |= {heading: [] for heading in self.further.values()}
-        for item in self.get_params(ctx):
-            heading = self.further.get(item.opts[0], "Options")
-            if isinstance(item, click.Argument):
-                heading = "Positional arguments"
-            if record := item.get_help_record(ctx):
-                shown[heading].append(record)
-        for heading, records in shown.items():
-            if records and (ctx.meta.get(ALL) or heading not in self.further.values()):
+        further = dict.fromkeys(self.further.values()) if ctx.meta.get(ALL) else ()
+        for heading in ("Positional arguments", "Options", *further):
+            params = (p for p in self.get_params(ctx) if self._heading(p) == heading)
+            if records := [r for p in params if (r := p.get_help_record(ctx))]:
                 with formatter.section(heading):
                     formatter.write_dl(records)
+
+    def _heading(self, param: click.Parameter) -> str:
+        is_option = isinstance(param, click.Option)
+        return self.further.get(param.opts[0], "Options") if is_option else "Positional arguments"
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the examples."""
@@ -137,26 +128,6 @@ class Command(click.Command):
 
 ALL: Final = "oodd_eval.all"
 """Key of `click.Context.meta`: whether a help text has all options."""
-
-
-def _help_all(left_out: int) -> click.Option:
-    """Return the option ``--help-all`` of a command whose ``--help`` leaves some options out."""
-
-    def show(ctx: click.Context, _option: click.Parameter, asked: bool) -> None:
-        if asked and not ctx.resilient_parsing:
-            ctx.meta[ALL] = True
-            click.echo(ctx.get_help())
-            ctx.exit()
-
-    return click.Option(
-        ["--help-all"],
-        is_flag=True,
-        is_eager=True,
-        expose_value=False,
-        callback=show,
-        show_default=False,
-        help=f"Show {left_out} more options and exit.",
-    )
 
 
 def write_section(formatter: click.HelpFormatter, heading: str, lines: Iterable[str]) -> None:
@@ -169,7 +140,6 @@ def write_section(formatter: click.HelpFormatter, heading: str, lines: Iterable[
 def command(
     *examples: str,
     plugins: bool = False,
-    repeated: Sequence[str] = (),
     further: Mapping[str, str] = MappingProxyType({}),
     kind: type[Command] = Command,
 ) -> Callable[[Handler], Command]:
@@ -177,7 +147,7 @@ def command(
 
     Parameters
     ----------
-    examples, repeated, further
+    examples, further
         As in `Command`.
     plugins
         Whether the command loads plug-ins, and so has the option ``-p``.
@@ -188,7 +158,7 @@ def command(
     def decorate(handler: Handler) -> Command:
         params = [*reversed(getattr(handler, "__click_params__", []))]
         options = _PLUGIN_OPTION if plugins else ()
-        return kind(handler, [*params, *options, *_VERBOSITY], examples, repeated, further)
+        return kind(handler, [*params, *options, *_VERBOSITY], examples, further)
 
     return decorate
 
@@ -243,15 +213,6 @@ class Group(click.Group):
             with formatter.section(heading):
                 rows = [(name.ljust(width), row[0]) for name, row in commands.items()]
                 formatter.write_dl(rows)
-
-    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write an example of each command whose extra is installed."""
-        examples: list[str] = []
-        for name in self.entries:
-            with contextlib.suppress(MissingExtraError):
-                loaded = self.get_command(ctx, name)
-                examples += loaded.examples[:1] if isinstance(loaded, Command) else []
-        write_section(formatter, "Examples", [f"oodd-eval {line}" for line in examples])
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> Items:
         """Complete names of commands without importing them, and options."""
@@ -320,12 +281,6 @@ def _names(kind: str) -> Iterable[str]:
     return [name for name, *_ in rows if name[0].isalnum()]
 
 
-def _named(kind: click.ParamType[Any], metavar: str) -> click.ParamType[Any]:
-    """Return a type with another text in the help in place of the value."""
-    kind.name = metavar
-    return kind
-
-
 def plain_path(text: str) -> Path:
     """Return a path to read or write at; `UsageError` for a pipe, a device and the like."""
     path = Path(text)
@@ -374,7 +329,8 @@ FILE: Final = _PathType("FILE")
 LOGS: Final = _PathType("FILE", partly_read=True)
 OUTPUT_DIRECTORY: Final = _PathType("DIR", written=True)
 OUTPUT_FILE: Final = _PathType("FILE", written=True)
-COUNT: Final = _named(click.IntRange(min=1), "N")
+COUNT: Final = click.IntRange(min=1)
+COUNT.name = "N"
 HORIZONS: Final = Converted(partial(whole_numbers, least=1), "N,...")
 SEEDS: Final = Converted(partial(whole_numbers, least=0), "N,...")
 TIME: Final = Converted(seconds, "TIME")
@@ -442,17 +398,17 @@ detector_options: Final = together(
 )
 
 
+jobs_option: Final = click.option(
+    "--jobs", type=COUNT, help="processes at a time (default: one per core)"
+)
+
+
 def limit_options(process: str, timeout: str) -> Decorator:
     """Return the options that limit the time and the memory of a process."""
     return together(
         click.option("--timeout", default=timeout, type=TIME, help=f"wall-clock time of {process}"),
         click.option("--memory", default="8GB", type=MEMORY, help=f"resident memory of {process}"),
     )
-
-
-jobs_option: Final = click.option(
-    "--jobs", type=COUNT, help="processes at a time (default: one per core)"
-)
 
 
 def fit_options(timeout: str) -> Decorator:

@@ -1,7 +1,8 @@
 """``oodd-eval info``: describe a detector, an environment, an anomaly, a split or a metric."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+import textwrap
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain
 from typing import Any, Final
 
@@ -23,30 +24,33 @@ from oodd_eval.data.facts import (
 )
 from oodd_eval.data.layout import log_facts
 from oodd_eval.data.registry import AnomalySpec, Spec
-from oodd_eval.data.split import imported_environments, split_directories
+from oodd_eval.data.split import Split, imported_environments, split_directories
 from oodd_eval.errors import UnknownNameError, UsageError, near
-from oodd_eval.metrics.catalogue import NAMES, MetricInfo, metric_info
+from oodd_eval.metrics.catalogue import INTERVENTIONS, NAMES, MetricInfo, metric_info
 from oodd_eval.names import counted
-from oodd_eval.plugins.contract import Alarm, Training
+from oodd_eval.plugins.contract import Alarm
 from oodd_eval.plugins.discovery import Offer
 from oodd_eval.plugins.parameters import parameters_of
 
 Lines = Iterator[tuple[str, str]]
+
+SCREEN: Final = 40  # lines, without --wide
 
 
 @command("info pe", "info hopper", "info gravity", "info mini", "info auc_matched", plugins=True)
 @click.argument(
     "name", type=Name(*KINDS), metavar="NAME", help="of a detector, environment, anomaly, ..."
 )
+@click.option("--wide", is_flag=True, help="print all there is, which may take several screens")
 def info(options: Options) -> int:
-    """Print all there is to know of one detector, environment, anomaly, split or metric."""
+    """Describe one detector, environment, anomaly, split or metric, on one screen."""
     name = options.name
     if name in ENVIRONMENTS:
         lines = _environment(ENVIRONMENTS[name])
     elif name in ANOMALIES:
         lines = _anomaly(ANOMALIES[name])
-    elif name in NAMES:
-        lines = _metric(metric_info(name))
+    elif name in (*NAMES, *INTERVENTIONS):
+        lines = _metric(name)
     else:
         plugins = discovered(options)
         custom = plugins.custom_specs
@@ -58,30 +62,38 @@ def info(options: Options) -> int:
                 lines = _custom(*custom[name])
             elif name in imported:
                 lines = _imported(name, *imported[name])
-            elif name in split_directories():
+            elif options.wide and name in split_directories():
                 described: int = load("oodd_eval.cli.data:info").handler(options)
                 return described
-            elif name in SPLITS:
-                lines = _absent(*next(r for r in rows("splits", plugins) if r[0] == name))
+            elif row := next((r for r in rows("splits", plugins) if r[0] == name), None):
+                lines = _split(*row)
             else:
                 lines = _detector(plugins.offer(name))
         except UnknownNameError:
             names = [*ENVIRONMENTS, *ANOMALIES, *custom, *imported, *plugins.offers]
-            names += [*SPLITS, *split_directories(), *NAMES]
+            names += [*SPLITS, *split_directories(), *NAMES, *INTERVENTIONS]
             close = near(name, names)
             meant = f": did you mean {' or '.join(map(repr, close))}?" if close else ":"
             kinds = "detector, environment, anomaly, split or metric"
             raise UsageError(
                 f"unknown {kinds} {name!r}{meant} `oodd-eval list KIND` has all names of a kind"
             ) from None
-    print(tabulate(lines, tablefmt="plain", disable_numparse=True))
+    text = tabulate(lines, tablefmt="plain", disable_numparse=True).splitlines()
+    if len(text) > SCREEN and not options.wide:
+        text[SCREEN - 1 :] = [f"{len(text) - SCREEN + 1} more lines: oodd-eval info {name} --wide"]
+    print("\n".join(text))
     return 0
 
 
-def _absent(split: str, sizes: str, why: str) -> Lines:
-    yield "split", split
-    yield "trajectories", sizes
-    yield "digest", f"unknown, as it is {why}"
+def _split(name: str, sizes: str, state: str) -> Lines:
+    yield from (("split", name), ("trajectories", sizes), ("state", state))
+    if path := split_directories().get(name):
+        split = Split(path)
+        entries = split.manifest["environments"].items()
+        yield from _wrapped("sensors", (f"{key} {len(entry['sensors'])}" for key, entry in entries))
+        kinds = dict.fromkeys(condition.partition("@")[0] for condition in split.anomalies)
+        yield from _wrapped("anomalies", kinds)
+        yield "more", f"oodd-eval info {name} --wide"
 
 
 def _environment(info: EnvironmentInfo) -> Lines:
@@ -95,8 +107,14 @@ def _environment(info: EnvironmentInfo) -> Lines:
 
 def _columns(noun: str, columns: Sequence[Quantity]) -> Lines:
     """Yield names with units, and before the first one how many there are."""
-    for i, column in enumerate(columns):
-        yield "" if i else counted(len(columns), noun), f"{column.name} ({column.unit})"
+    return _wrapped(counted(len(columns), noun), [f"{c.name} ({c.unit})" for c in columns])
+
+
+def _wrapped(heading: str, words: Iterable[str]) -> Lines:
+    """Yield a heading with the words behind it in lines that break between two words."""
+    text = ", ".join(word.replace(" ", "\u00a0") for word in words)
+    for i, line in enumerate(textwrap.wrap(text, 80, break_on_hyphens=False)):
+        yield "" if i else heading, line.replace("\u00a0", " ")
 
 
 def _custom(spec: Spec, origin: str) -> Lines:
@@ -131,56 +149,41 @@ def _imported(name: str, split: str, entry: Mapping[str, Any]) -> Lines:
 
 def _anomaly(info: AnomalyInfo) -> Lines:
     unit_of, bound_of = (load(f"oodd_recording.values:{name}") for name in ("unit_of", "bound_of"))
-    of_paper = " of the paper" if info.id in TABLE1 else ""
-    yield "anomaly", f"{info.id} ({info.title}{of_paper})"
+    yield "anomaly", f"{info.id} ({info.title}{' of the paper' * (info.id in TABLE1)})"
     yield "group", info.group
     yield "what it changes", info.summary
     for environment in ENVIRONMENTS:
-        if info.id not in read_ladder().get(environment, {}):
-            bound, unit = bound_of(environment, info.id), unit_of(environment, info.id)
-            yield f"strength in {environment}", f"0 to {bound:g} ({unit}): not calibrated"
-            continue
-        rungs = rungs_of(environment, info.id)
-        ends = [f"{rungs[name].strength:.3g}" for name in (["kept99", [*rungs][-1]])]
-        strengths, names = map(_range, (ends, ["kept99", [*rungs][-1]]))
-        text = f"{strengths} ({unit_of(environment, info.id)}): {names}"
-        yield f"strength in {environment}", text
+        strengths = f"0 to {bound_of(environment, info.id):g}, not calibrated"
+        if info.id in read_ladder().get(environment, {}):
+            rungs = rungs_of(environment, info.id)
+            ends = dict.fromkeys(("kept99", [*rungs][-1]))
+            strengths = " to ".join(f"{rungs[name].strength:.3g} ({name})" for name in ends)
+        yield f"strength in {environment}", f"{strengths}: {unit_of(environment, info.id)}"
 
 
-def _range(ends: list[str]) -> str:
-    """Return the first to the last, once where they are one."""
-    return " to ".join(dict.fromkeys(ends))
-
-
-_BETTER: Final = {"higher": "higher is better", "lower": "lower is better", "": "neither"}
 _UNITS: Final = {"percent": "a share, printed in percent", "steps": "steps", "rate": "a number"}
 _CELLS: Final = {"paired": "with twins", "unpaired": "without twins", "": "with and without twins"}
 
 
-def _metric(info: MetricInfo) -> Lines:
+def _facts(name: str) -> MetricInfo:
+    return INTERVENTIONS.get(name) or metric_info(name)
+
+
+def _metric(name: str) -> Lines:
+    info = _facts(name)
     low, high = info.range
     yield "metric", f"{info.name} ({info.title})"
     yield "what it says", info.summary
     yield "unit", f"{_UNITS[info.unit]}, from {low:g} to {high:g}"
-    yield "better side", _BETTER[info.better]
+    yield "better side", f"{info.better or 'neither'} is better"
     if info.level:
         yield "alarms", f"guaranteed, in at most {info.level} of nominal episodes"
     if info.null:
-        yield "by chance", f"{info.null}: {metric_info(info.null).summary}"
-    yield "cells", _CELLS[info.cells]
+        yield "by chance", f"{info.null}: {_facts(info.null).summary}"
+    yield "cells", "of interventions" if info.name in INTERVENTIONS else _CELLS[info.cells]
     if info.request:
         yield "computed", "when asked for (--row-metrics)"
     yield "more", "docs/metrics.md"
-
-
-_TRAINING: Final[Mapping[Training, str]] = {
-    "nominal": "the nominal trajectories of a split",
-    "simulation": "simulation: nominal episodes of its own besides (boards do not rank it)",
-    "anomalies": "anomalies (boards do not rank it)",
-    "failures": "nominal and failed training episodes (boards do not rank it)",
-    "external": "external data (boards do not rank it)",
-    "oracle": "nominal trajectories, with the true equations (boards do not rank it)",
-}
 
 
 _ALARMS: Final[Mapping[Alarm, str]] = {
@@ -202,7 +205,8 @@ def _detector(offer: Offer) -> Lines:
     if spec.with_actions:
         yield "with actions", f"{spec.with_actions} runs in its place, unless actions is no"
     yield "alarm", _ALARMS[spec.alarm]
-    yield "trained on", _TRAINING[spec.training]
+    further = f"{spec.training} (boards do not rank it)"
+    yield "trained on", "nominal trajectories" if spec.training == "nominal" else further
     yield "seed", "changes nothing" if spec.deterministic else "decides random draws"
     for i, (name, parameter) in enumerate(parameters_of(spec.parameters).items()):
         default = f"{name} = {json.dumps(parameter.default, default=str)}"

@@ -1,5 +1,6 @@
 """``oodd-eval list``: one line each, the name first."""
 
+import re
 from collections.abc import Iterable
 from dataclasses import asdict
 from typing import Final, TypeVar
@@ -16,11 +17,12 @@ from oodd_eval.metrics.catalogue import (
     INTERVENTIONS,
     LEVELS,
     METRICS,
+    RANKING,
     metric_info,
 )
 from oodd_eval.names import check_known, counted
 from oodd_eval.plugins.contract import training_mark
-from oodd_eval.plugins.discovery import Plugins, discover
+from oodd_eval.plugins.discovery import Offer, Plugins, discover
 
 T = TypeVar("T")
 Rows = Iterable[tuple[str, ...]]
@@ -84,15 +86,30 @@ def _imported() -> Rows:
 
 
 def _detectors(plugins: Plugins) -> Rows:
-    for name, offer in plugins.offers.items():
+    for name, offer in sorted(plugins.offers.items(), key=_group):
         why = offer.unavailable()
         marks = f"[unavailable: {why}] " if why else ""
         mark = training_mark(offer.spec.training)
         marks += f"[{mark}] " if mark else ""
-        yield name, offer.origin, marks + offer.spec.summary
+        yield name, _origin(offer), marks + offer.spec.summary
     for name, origin, forms in plugins.spec_forms():
         yield f"({name})", origin, forms
     yield from ((b.plugin, b.distribution, f"[broken plug-in] {b.reason}") for b in plugins.broken)
+
+
+def _group(entry: tuple[str, Offer]) -> tuple[object, ...]:
+    """Return by which detectors are sorted: plug-ins, methods of papers, trivial rows, others."""
+    (name, offer), training = entry, entry[1].spec.training
+    origin = _origin(offer)
+    return origin != offer.origin, training != "nominal", origin == "trivial", origin, name
+
+
+def _origin(offer: Offer) -> str:
+    """Return whose a detector is: first author and year of a shipped one, else its distribution."""
+    if offer.distribution != "oodd-eval":
+        return offer.origin
+    source = re.search(r"([A-Z][\w-]+).*?\((\d{4})\)", offer.spec.reference)
+    return " ".join(source.groups()) if source else "trivial"
 
 
 def _splits() -> Rows:
@@ -116,11 +133,15 @@ def _splits() -> Rows:
         yield name, text.format_map(sizes) + suite + noise, state
 
 
+_FIRST: Final = (RANKING, "found_within_20_at_5pct", "missed_at_5pct", "false_episodes_at_5pct")
+"""Metrics of the table that a run ends with, in its order."""
+
+
 def _metrics() -> Rows:
-    yield from ((name, info.summary) for name, info in METRICS.items())
+    yield from ((n, metric_info(n).summary) for n in dict.fromkeys([*_FIRST, *METRICS]))
     for suffix, level in LEVELS.items():
         at = f"guaranteed alarms, in at most {100 * level:g} % of nominal episodes"
         yield f"..._{suffix}", f"{', '.join(GUARANTEED)}: {at}"
         yield f"threshold_{suffix}", "the threshold of their statistic"
-    yield from ((name, metric_info(name).summary) for name in ATTRIBUTION)
+    yield from ((name, metric_info(name).meaning) for name in ATTRIBUTION)
     yield from ((name, f"intervene: {info.summary}") for name, info in INTERVENTIONS.items())

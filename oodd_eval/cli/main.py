@@ -37,42 +37,34 @@ EXIT_CODES: Final = (
     "5  nothing was selected or compared",
 )
 
+_LOGS, _BOARD = "oodd_logs.commands", "oodd_leaderboard.commands"
+_RECORDING, _ACTS = "oodd_recording.commands", "oodd_interventions.commands"
+_SCORES: Final = "oodd_monitors.commands.calibrate_score"
+
 DATA: Final[Commands] = {
-    "inspect": ("look at logs, write a first recipe", "oodd_logs.commands.inspect_logs:inspect"),
-    "import": (
-        "import logs of your own as an environment",
-        "oodd_logs.commands.imports:import_logs",
-    ),
+    "inspect": ("look at logs, write a first recipe", f"{_LOGS}.inspect_logs:inspect"),
+    "import": ("import logs as an environment", f"{_LOGS}.imports:import_logs"),
     "info": ("describe a split", "oodd_eval.cli.data:info"),
     "verify": ("compare a split with its digests", "oodd_eval.cli.data:verify"),
     "fetch": ("verify a copy of a split and install it", "oodd_eval.cli.data:fetch"),
-    "export": ("write a split in another project's format", "oodd_logs.commands.exports:export"),
-    "build": ("record a split (extra sim)", "oodd_recording.commands:build"),
-    "calibrate": ("find the ladder's strengths (extra sim)", "oodd_recording.commands:calibrate"),
-    "page": ("write the page of an environment (extra sim)", "oodd_recording.commands:page"),
+    "export": ("write a split in another project's format", f"{_LOGS}.exports:export"),
+    "build": ("record a split (extra sim)", f"{_RECORDING}:build"),
+    "calibrate": ("find the ladder's strengths (extra sim)", f"{_RECORDING}:calibrate"),
+    "page": ("write the page of an environment (extra sim)", f"{_RECORDING}:page"),
 }
 
 LEADERBOARD: Final[Commands] = {
-    "show": ("print the last season's board", "oodd_leaderboard.commands.published_board:show"),
-    "place": (
-        "show where a run would stand on it",
-        "oodd_leaderboard.commands.published_board:place_run",
-    ),
-    "submit": ("write an entry from a run", "oodd_leaderboard.commands.entries:submit"),
-    "season": (
-        "run every entry on a fresh split (extra sim)",
-        "oodd_leaderboard.commands.season:season",
-    ),
-    "build": ("render page, tables and site", "oodd_leaderboard.commands.entries:build"),
+    "show": ("print the last season's board", f"{_BOARD}.published_board:show"),
+    "place": ("show where a run would stand on it", f"{_BOARD}.published_board:place_run"),
+    "submit": ("write an entry from a run", f"{_BOARD}.entries:submit"),
+    "season": ("run every entry on a fresh split (extra sim)", f"{_BOARD}.season:season"),
+    "build": ("render page, tables and site", f"{_BOARD}.entries:build"),
 }
 
 POLICIES: Final[Commands] = {
-    "train": ("train a policy (extra train)", "oodd_recording.commands:train"),
-    "import": (
-        "take a policy over from ONNX (extra onnx)",
-        "oodd_recording.commands:import_policy",
-    ),
-    "evaluate": ("mean return of a policy (extra sim)", "oodd_recording.commands:evaluate"),
+    "train": ("train a policy (extra train)", f"{_RECORDING}:train"),
+    "import": ("take a policy over from ONNX (extra onnx)", f"{_RECORDING}:import_policy"),
+    "evaluate": ("mean return of a policy (extra sim)", f"{_RECORDING}:evaluate"),
 }
 
 COMMANDS: Final[Mapping[str, Commands]] = {
@@ -81,18 +73,12 @@ COMMANDS: Final[Mapping[str, Commands]] = {
         "show": ("print the tables of earlier results", "oodd_eval.cli.show:show"),
         "compare": ("compare rows, or results with a reference", "oodd_eval.cli.compare:compare"),
         "forget": ("remove cells from a results directory", "oodd_eval.cli.forget:forget"),
-        "intervene": (
-            "tell what acting at an alarm saves (extra sim)",
-            "oodd_interventions.commands:intervene",
-        ),
+        "intervene": ("tell what acting at an alarm saves (extra sim)", f"{_ACTS}:intervene"),
         "reproduce": ("compute the paper's tables and claims", "oodd_paper.command:reproduce"),
     },
     "Use logs of your own": {
-        "scan": ("find odd episodes in recorded logs", "oodd_logs.commands.scan_logs:scan"),
-        "calibrate": (
-            "find the threshold of a recorded score",
-            "oodd_monitors.commands.calibrate_score:calibrate_score",
-        ),
+        "scan": ("find odd episodes in recorded logs", f"{_LOGS}.scan_logs:scan"),
+        "calibrate": ("find the threshold of a recorded score", f"{_SCORES}:calibrate_score"),
         "data": ("inspect and import logs, record and fetch splits", DATA),
     },
     "Look up": {

@@ -35,7 +35,7 @@ from oodd_eval.cli.plugins import discovered
 from oodd_eval.cli.reporter import TerminalReporter, print_report
 from oodd_eval.data.bounded import read_toml
 from oodd_eval.data.files import write_text
-from oodd_eval.data.layout import log_facts
+from oodd_eval.data.layout import is_paired
 from oodd_eval.data.split import Split, load_split, split_places
 from oodd_eval.errors import UsageError
 from oodd_eval.metrics.promise import PromiseFinding
@@ -121,9 +121,10 @@ def run(options: Options) -> int:
     else:
         plugins = discovered(options)
     environments, anomalies = split.select(options.env, options.anomaly)
-    if options.row_metrics and not any(_lacks_twins(split, name) for name in environments):
+    paired = {is_paired(split.manifest["environments"][name]) for name in environments}
+    if options.row_metrics and False not in paired:
         raise UsageError(f"--row-metrics is for splits without twins, unlike split {split.name}")
-    if options.paper and all(_lacks_twins(split, name) for name in environments):
+    if options.paper and True not in paired:
         raise UsageError(f"--paper is for splits with twins, unlike split {split.name}")
     plan = make_plan(
         plugins,
@@ -185,12 +186,6 @@ def run(options: Options) -> int:
     return int(bool(plugins.broken) or not all(record.ok for record in done.records))
 
 
-def _lacks_twins(split: Split, environment: str) -> bool:
-    """Tell whether an environment is of logs whose anomalous episodes have no nominal twins."""
-    facts = log_facts(split.manifest["environments"][environment])
-    return facts is not None and not facts.paired
-
-
 def _left(plan: Plan, done: RunOutcome, *, fresh: bool) -> str:
     """Return how a run goes on that has not done all: which fits are kept, and by which command."""
     kept = len({(r.environment, r.cell.label) for r in done.records if r.ok})
@@ -198,16 +193,12 @@ def _left(plan: Plan, done: RunOutcome, *, fresh: bool) -> str:
     if kept == every:
         return ""
     again = "the same command without --fresh" if fresh and kept else "the same command"
-    rest = "it" if every == 1 else "all" if not kept else "the others"
-    rest = "the other" if 1 <= kept == every - 1 else rest
+    advice = f"{again} fits the rest"
     if done.left:
         advice = f"{again} continues"
     elif any(record.status == "unavailable" for record in done.records):
-        advice = f"install what is named above, then {again} fits {rest}"
-    else:
-        advice = f"{again} fits {rest} again"
-    are = "is" if 1 in (kept, every) else "are"
-    return f"{kept} of {counted(every, 'fit(s)')} {are} kept; {advice}"
+        advice = f"install what is named above, then {advice}"
+    return f"{kept} of {counted(every, 'fit(s)')} kept; {advice}"
 
 
 class _Doubts:

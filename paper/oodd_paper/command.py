@@ -46,7 +46,6 @@ _OF_RUNS: Final = (
     "reproduce --tier mini",
     "reproduce --tier reduced --plan",
     plugins=True,
-    repeated=["--records"],
     further={
         "Where, and within which limits": "--device --timeout --memory -p",
         "Pages": "--records --beside --no-figures",
@@ -82,8 +81,7 @@ _OF_RUNS: Final = (
     "--records",
     multiple=True,
     type=DIRECTORY,
-    metavar="DIR...",
-    help="with --render-only: read all results below these directories instead",
+    help="with --render-only: read results below this directory instead, or below several",
 )
 @click.option(
     "--beside",

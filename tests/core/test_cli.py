@@ -18,7 +18,7 @@ from helpers_plugins import install
 from helpers_split import make_split
 from rich.console import Console
 
-from oodd_eval.cli import ALL, Group, listing
+from oodd_eval.cli import ALL, Group, info, listing
 from oodd_eval.cli import main as cli
 from oodd_eval.cli import run as run_module
 from oodd_eval.errors import UnknownNameError
@@ -140,9 +140,9 @@ def test_x_stops_at_the_first_failure(run, failing):
     code, out, _ = run(*several, "-x")
     assert code == 1
     assert re.search(r"^8 error in", out, re.MULTILINE)
-    assert out.splitlines()[-1].startswith("0 of 4 fits are kept; ")
+    assert out.splitlines()[-1].startswith("0 of 4 fits kept; ")
     last = run(*several, "--fresh", "-q", "--env", "cartpole")[1].splitlines()[-1]
-    assert last.startswith("1 of 2 fits is kept; ")
+    assert last.startswith("1 of 2 fits kept; ")
     assert "without --fresh" in last
 
 
@@ -350,6 +350,22 @@ def test_lists_have_one_line_each_name_first(run, kind):
                 "metrics": "auc_matched"}  # fmt: skip
     assert code == 0
     assert expected[kind] in first
+
+
+def test_lists_begin_with_what_a_newcomer_needs(run, plugin):
+    plugin("mine", "@hookimpl\ndef oodd_detectors(): return offer(zzz=Good)")
+    rows = [line.split(maxsplit=1) for line in run("list", "detectors")[1].splitlines()]
+    assert rows[0][0] == "zzz"  # of somebody's own plug-in
+    whose = {name: rest.partition("  ")[0] for name, rest in rows}
+    assert whose["riqn"] == whose["rf"] == "Danesh 2021"
+    assert whose["tdqc"] == "Francis-Meretzki 2026"
+    assert whose["clock"] == "trivial"
+    order = [name for name, _ in rows]
+    assert order.index("riqn") < order.index("clock") < order.index("tdqc") < order.index("oracle")
+    metrics = [line.split()[0] for line in run("list", "metrics")[1].splitlines()]
+    assert metrics[:4] == [
+        "auc_matched", "found_within_20_at_5pct", "missed_at_5pct", "false_episodes_at_5pct",
+    ]  # fmt: skip
 
 
 def test_show_prints_what_the_run_printed(run, clock):
@@ -590,10 +606,30 @@ def test_info_describes_whatever_has_a_name(run, name, facts):
     assert all(re.search(fact, out, re.MULTILINE) for fact in facts)
 
 
-def test_info_of_a_split_is_its_description_and_near_names_are_offered(run):
+def test_info_fits_a_screen_and_wide_has_the_rest(run, monkeypatch):
+    code, brief, _ = run("info", "ant")
+    assert code == 0
+    assert re.search(
+        r"^28 sensors +torso height above its start \(m\), sine of", brief, re.MULTILINE
+    )
+    for name in ("arm", "gravity", "payload", "panel", "rf", "mini", "worlds", "return_saved"):
+        code, out, _ = run("info", name)
+        assert (code, name, out.count("\n") <= 40) == (0, name, True)
+    monkeypatch.setattr(info, "_detector", lambda _: ((f"p{i}", "") for i in range(60)))
+    lines = run("info", "rf")[1].splitlines()
+    assert (len(lines), lines[-1]) == (40, "21 more lines: oodd-eval info rf --wide")
+    assert len(run("info", "rf", "--wide")[1].splitlines()) == 60
+
+
+def test_info_of_a_split_is_brief_and_wide_is_its_description(run):
     code, out, _ = run("info", "tiny")
-    assert (code, out) == run("data", "info", "tiny")[:2]
-    assert out.startswith("split tiny, digest ")
+    assert code == 0
+    assert re.search(r"^state +2 environments, digest [0-9a-f]{12}$", out, re.MULTILINE)
+    assert re.search(r"^sensors +cartpole 4, hopper 15$", out, re.MULTILINE)
+    assert run("info", "tiny", "--wide") == run("data", "info", "tiny")
+
+
+def test_near_names_are_offered(run):
     near = {"gravty": "gravity", "auc_mached": "auc_matched", "tinny": "tiny", "nonsense": ""}
     for name, offered in near.items():
         code, _, err = run("info", name)

@@ -135,6 +135,6 @@ def test_an_interrupted_command_ends_with_2_and_keeps_its_records(tiny_split, pl
     assert process.returncode == 2
     assert "2 ok in" in printed
     assert "interrupted" in printed
-    assert "1 of 4 fits is kept; the same command continues" in printed
+    assert "1 of 4 fits kept; the same command continues" in printed
     assert {r.seed for r in ResultsDirectory(output).records()} == {0}
     assert not workers_of(f"RUN={output}")
