@@ -488,10 +488,14 @@ def packages() -> dict[str, str]:
 
 
 def _commit() -> dict[str, Any]:
-    """Return commit and dirty flag when the harness runs from a checkout of its own."""
+    """Return commit and dirty flag when the harness runs from a checkout of its own.
+
+    Tracked files of the packages alone make it dirty: results and notes change no score.
+    """
     try:
         _git("ls-files", "--error-unmatch", "__init__.py")
-        return {"git_commit": _git("rev-parse", "HEAD"), "git_dirty": bool(_git("status", "-s"))}
+        changes = _git("status", "-s", "--untracked-files=no", "--", ":(top,glob)**/oodd_*/**")
+        return {"git_commit": _git("rev-parse", "HEAD"), "git_dirty": bool(changes)}
     except (OSError, subprocess.SubprocessError):
         return {"git_commit": None, "git_dirty": None}
 

@@ -212,16 +212,29 @@ def test_the_commit_is_read_without_writing_to_the_checkout(tmp_path, monkeypatc
         done = ["git", "-C", tmp_path, *told, *arguments]
         return subprocess.run(done, check=True, capture_output=True, text=True).stdout.strip()
 
-    file = tmp_path / "__init__.py"
-    file.write_text("1\n")
+    package, notes = tmp_path / "oodd_eval", tmp_path / "docs" / "notes.md"
+    detector = tmp_path / "detectors" / "rf" / "oodd_rf" / "forest.py"
+    for file in (notes, detector, package / "__init__.py"):
+        file.parent.mkdir(parents=True)
+        file.write_text("1\n")
     git("init", "-q")
     git("add", "-A")
     git("commit", "-qm", "one")
-    monkeypatch.setattr(record_module, "_HOME", tmp_path)
+    monkeypatch.setattr(record_module, "_HOME", package)
     os.utime(file, (1, 1))  # git has to look whether it is the same
     index = (tmp_path / ".git" / "index").read_bytes()
     found = record_module.gather()
     assert (found["git_commit"], found["git_dirty"]) == (git("rev-parse", "HEAD"), False)
     assert (tmp_path / ".git" / "index").read_bytes() == index
-    file.write_text("2\n")
-    assert record_module.gather()["git_dirty"] is True
+    # Results that nobody has committed, and documents, change no score.
+    (tmp_path / "oodd-results").mkdir()
+    (tmp_path / "oodd-results" / "records.jsonl").write_text("{}\n")
+    (package / "notes.txt").write_text("untracked\n")
+    notes.write_text("2\n")
+    assert record_module.gather()["git_dirty"] is False
+    for changed in (file, detector):
+        before = changed.read_text()
+        changed.write_text("2\n")
+        assert record_module.gather()["git_dirty"] is True
+        changed.write_text(before)
+        assert record_module.gather()["git_dirty"] is False
