@@ -1,4 +1,4 @@
-"""Cores that this process may use: of its affinity, its cgroups and its limits.
+"""Cores that this process may use: of its affinity, its cgroups, its batch job and its limits.
 
 A batch job or a container has a share of its machine. Jobs beyond that share wait for each other,
 and jobs beyond a limit on processes or open files fail.
@@ -32,9 +32,12 @@ def available_cores(root: Path = Path("/")) -> int:
 
 
 def _limits() -> Iterator[float]:
-    """Yield the jobs for which open files and processes last."""
+    """Yield the cores of a task of SLURM, and the jobs for which open files and processes last."""
     import resource  # noqa: PLC0415  POSIX only
 
+    # Not every SLURM binds a task to its cores.
+    with contextlib.suppress(KeyError, ValueError):
+        yield int(os.environ["SLURM_CPUS_PER_TASK"])
     for limit, each in ((resource.RLIMIT_NOFILE, _FILES), (resource.RLIMIT_NPROC, _PROCESSES)):
         most, _ = resource.getrlimit(limit)
         if most != resource.RLIM_INFINITY:

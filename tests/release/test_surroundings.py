@@ -398,6 +398,13 @@ def test_jobs_follow_affinity_and_limits(roomy, tmp_path):
     assert available_cores(tmp_path) == 1
 
 
+@pytest.mark.parametrize(("cores", "expected"), [("1", 1), ("64", 2), ("1(x2)", 2), ("", 2)])
+def test_jobs_follow_the_cores_of_a_batch_job(roomy, monkeypatch, tmp_path, cores, expected):
+    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:2])
+    monkeypatch.setenv("SLURM_CPUS_PER_TASK", cores)
+    assert available_cores(tmp_path) == expected
+
+
 # The lowest versions
 
 WITH = ("gym", "worlds", "onnx", "dask", "logs", "plots", "check")
