@@ -130,6 +130,15 @@ def python_blocks(text):
     return re.findall(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
 
 
+def python_with_output(text):
+    """Python blocks of a page, each with the text block below it, which it prints, or None."""
+    blocks = [*re.finditer(r"^```(\w*)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)]
+    for block, below in zip(blocks, [*blocks[1:], None], strict=True):
+        if block[1] == "python":
+            printed = below and below[1] == "text" and not text[block.end() : below.start()].strip()
+            yield block[2], below[2] if printed else None
+
+
 def matching(rules, command):
     return next((rule for rule in rules if re.search(rule.pattern, command)), None)
 

@@ -18,6 +18,7 @@ from helpers_docs import (
     matching,
     parse,
     python_blocks,
+    python_with_output,
     quick,
 )
 
@@ -280,11 +281,13 @@ def test_commands_of_a_page_do_what_it_says(path, tmp_path, monkeypatch, capsys,
 
 @pytest.mark.filterwarnings("ignore::oodd_eval.errors.PromiseWarning")  # of few recordings
 @pytest.mark.parametrize("path", [p for p in WITH_PYTHON if name(p) not in FRAGMENTS], ids=name)
-def test_python_of_a_page_runs(path, tmp_path, monkeypatch):
+def test_python_of_a_page_runs_and_prints_what_is_shown(path, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     namespace = {"__name__": "page"}
-    for block in python_blocks(path.read_text()):
+    for block, shown in python_with_output(path.read_text()):
         exec(compile(block, name(path), "exec"), namespace)  # noqa: S102  the documents' own
+        printed = capsys.readouterr().out
+        assert shown is None or printed == shown
 
 
 def test_rules_have_reasons_and_are_needed():
