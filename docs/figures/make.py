@@ -1,7 +1,7 @@
-"""Draw the figures of the README, of the home page and of docs/protocol.md.
+"""Draw the figures of the README and home page, of docs/protocol.md and docs/results/ladder.md.
 
 ``python docs/figures/make.py [DIRECTORY]`` writes the SVG files, here unless told otherwise. The
-README's is drawn from the committed results on the ladder, the others from Hopper in the split that
+ladder's is drawn from the committed results on the ladder, the others from Hopper in the split that
 comes with the package: one episode goes through those of docs/protocol.md. They have no background,
 and colours that can be read on white and on black.
 """
@@ -46,7 +46,7 @@ DRAWN = {
     "rf": "#A0703C",
     "persistence": GREY,
 }
-"""Rows of the README's figure: the best, some of the paper, and one that knows nothing."""
+"""Rows of the ladder's figure: the best, some of the paper, and one that knows nothing."""
 
 STYLE = {
     "svg.hashsalt": "oodd-eval",

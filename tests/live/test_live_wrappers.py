@@ -1,6 +1,5 @@
-"""A watchdog around Gymnasium's environments, in a terminal, and in the README."""
+"""A watchdog around Gymnasium's environments, and in a terminal."""
 
-import contextlib
 import io
 import re
 import sys
@@ -330,14 +329,3 @@ def test_training_logs_alarms_and_ends_at_one_if_asked(callbacks, capsys):
             callback.on_evaluation({"info": reading(t, alarm=t >= first)}, {})
     callback.on_evaluation({"info": {}}, {})
     assert callback.evaluated == [None, 3, None]
-
-
-@pytest.mark.docs
-def test_the_snippet_of_the_readme_prints_what_it_says():
-    (snippet,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
-    assert len(snippet.splitlines()) <= 12
-    printed = io.StringIO()
-    with contextlib.redirect_stdout(printed):
-        exec(compile(snippet, "README.md", "exec"), {})  # noqa: S102
-    said = re.search(r"print\(info\[\"oodd\"\]\)  # (row \d+: alarm, [a-z ,]+) \d+%", snippet)[1]
-    assert printed.getvalue().startswith(said)

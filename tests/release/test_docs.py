@@ -213,7 +213,8 @@ def test_figures_of_the_protocol_are_all_shown_and_described():
     assert {figure for _, figure in shown} == drawn - {"intervention", "power", "shutdown"}
     assert "(figures/intervention.svg)" in (DOCS / "interventions.md").read_text()
     assert "(figures/shutdown.svg)" in (DOCS / "index.md").read_text()
-    assert "(docs/figures/power.svg)" in (ROOT / "README.md").read_text()
+    assert "(docs/figures/shutdown.svg)" in (ROOT / "README.md").read_text()
+    assert "(../figures/power.svg)" in (DOCS / "results/ladder.md").read_text()
     assert all(len(described) > 30 for described, _ in shown)
 
 

@@ -28,6 +28,21 @@ def test_extras_in_the_commands_exist():
     assert all(extra in extras for group in named for extra in group.split(","))
 
 
+def test_the_readme_is_read_in_three_minutes():
+    assert len(README.split()) <= 700
+
+
+@pytest.mark.docs
+def test_the_first_command_prints_the_table_below_it(tmp_path, monkeypatch, capsys):
+    from oodd_eval.cli.main import main
+
+    monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.chdir(tmp_path)
+    assert main(commands()["start"].split("oodd-eval ", 1)[1].split()) == 0
+    block = README.partition("<!-- command: start -->")[2].partition("```text\n")[2]
+    assert block.partition("```")[0] in capsys.readouterr().out
+
+
 def test_main_command_selects_cells():
     from oodd_eval.cli.main import main
 
