@@ -116,16 +116,13 @@ def tables_of(records):
     for board in boards(records):
         (environment,) = board.environments
         name = sets[environment]
-        texts = [
-            re.sub(r"^### (.*)", r"**\1**", markdown_table(table)).strip()
-            for table in Tables(board).of_logs()
-            if " by " not in table.title and "Metrics of rows" not in table.title
-        ]
+        table = Tables(board).headline()
+        text = re.sub(r"^### (.*)", r"**\1**", markdown_table(table)).strip()
         (digest,) = {r.split_digest for r in records if r.environment == environment}
         of = SETS[name]
         release = of["release"] + (f", whose recipe had {of['recipe']}" if "recipe" in of else "")
         head = f"Computed on {of['part']}, by release {release}; digest `{digest[:12]}`."
-        pages[name] = "\n\n".join([head, *texts])
+        pages[name] = f"{head}\n\n{text}"
     none = "No table: its files were not at hand."
     return {name: pages.get(name, none) for name in ORDER}
 

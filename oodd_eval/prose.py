@@ -97,8 +97,13 @@ def print_prose(text: str, console: Console, style: str = "") -> None:
 
 
 def print_sections(sections: Sequence[Section], console: Console) -> None:
-    """Print the verdict, tables, findings and notes of sections: what is read last stands last."""
+    """Print the verdict, tables, findings and notes of sections: what is read last stands last.
+
+    Several sections have their titles.
+    """
     for section in sections:
+        if len(sections) > 1:
+            print_prose(section.title, console, "bold")
         if section.verdict:
             print_prose(section.verdict + "\n", console, "bold")
         for table in section.tables:

@@ -7,7 +7,6 @@ are records.
 
 import json
 import lzma
-import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -17,13 +16,14 @@ from pydantic import TypeAdapter, ValidationError
 
 from oodd_eval.data.files import read_text
 from oodd_eval.errors import ResultsError, UsageError
-from oodd_eval.metrics.catalogue import FOUND_WITHIN, UNDEFINED
+from oodd_eval.metrics.catalogue import FOUND_WITHIN, RANKING, UNDEFINED
 from oodd_eval.metrics.ranking import PairedDifference, Position
 from oodd_eval.prose import Table
 from oodd_eval.results.board import Conditions, boards, expected_cells, grouped, level_of, ranked_by
 from oodd_eval.results.directory import read_records
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import NAN, Metric, Record, same_terms
+from oodd_eval.results.standings import with_interval
 from oodd_eval.results.tables import Tables
 from oodd_leaderboard.entry import Entry
 from oodd_leaderboard.reported import LeaderboardSection, by_detector
@@ -264,13 +264,4 @@ def _whose(row: Standing) -> str:
 
 def difference_text(test: PairedDifference) -> str:
     """Return a difference in points with its interval, of as many digits as tell it from 0."""
-    ends = [100 * end for end in (test.low, test.high) if not math.isnan(end)]
-    if not ends:
-        return f"{100 * test.difference:z.1f} points (no interval: too few test episodes)"
-    seen = all if test.told_apart else any
-    digits = next((n for n in (1, 2, 3) if seen(round(end, n) for end in ends)), 4)
-    value, low, high = (
-        UNDEFINED if math.isnan(end) else f"{100 * end:z.{digits}f}"
-        for end in (test.difference, test.low, test.high)
-    )
-    return f"{value} points [{low}, {high}]"
+    return with_interval(test.difference, test.low, test.high, RANKING)

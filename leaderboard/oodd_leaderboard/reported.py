@@ -189,8 +189,7 @@ def suite_sections(directory: Path) -> list[SuiteSection]:
     for path in filter(Path.is_dir, sorted((directory / SUITES).glob("*"))):
         for board in boards(ResultsDirectory(path).records()):
             graded = StrengthTables(board).overview() if board.paired else []
-            suite_tables = graded or [Tables(board).separability()]
-            suite_tables = suite_tables if board.paired else Tables(board).of_logs()
+            suite_tables = graded or [t for t in [Tables(board).headline()] if t]
             suites.append(SuiteSection(path.name, board, suite_tables, graded=bool(graded)))
     return suites
 

@@ -3,7 +3,6 @@
 import math
 import shlex
 import time
-from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
@@ -19,7 +18,7 @@ from oodd_eval.plugins import hookimpl
 from oodd_eval.prose import print_prose, print_sections
 from oodd_eval.results.board import boards, level_of, ranked_by
 from oodd_eval.results.directory import REPORT
-from oodd_eval.results.record import STATUSES, Record
+from oodd_eval.results.record import Record, summary
 from oodd_eval.results.report import Report
 from oodd_eval.scoring.display import Display
 from oodd_eval.scoring.plan import Plan
@@ -126,9 +125,3 @@ def print_report(report: Report, console: Console, path: Path) -> None:
     if report.detail == "brief" and not report.detector:
         more = f", {path / REPORT}" * (path / REPORT).is_file()
         console.print(f"everything else: oodd-eval show {shlex.quote(str(path))} --wide{more}")
-
-
-def summary(records: Sequence[Record]) -> str:
-    """Return how many cells came to which status, such as ``48 ok, 8 timeout``."""
-    counts = Counter(r.status for r in records)
-    return ", ".join(f"{counts[s]} {s}" for s in STATUSES if counts[s]) or "no cells"

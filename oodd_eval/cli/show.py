@@ -21,7 +21,7 @@ from oodd_eval.cli import (
     together,
 )
 from oodd_eval.cli.console import make_console
-from oodd_eval.cli.reporter import TerminalReporter, print_report, summary
+from oodd_eval.cli.reporter import TerminalReporter, print_report
 from oodd_eval.data.facts import ENVIRONMENTS, in_order
 from oodd_eval.data.split import Split, load_split, split_directories
 from oodd_eval.errors import UsageError
@@ -30,7 +30,7 @@ from oodd_eval.metrics.catalogue import NAMES
 from oodd_eval.names import check_known, expression, select
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.evaluate import rescore
-from oodd_eval.results.record import Record
+from oodd_eval.results.record import Record, summary
 from oodd_eval.results.render import FORMATS, Format
 from oodd_eval.results.report import Report
 from oodd_eval.results.tables import ROWS
@@ -63,7 +63,7 @@ _format_options: Final = together(
     "--detector", type=Name("detectors"), help="print the table by anomaly of one detector"
 )
 @click.option("--metric", type=Name("metrics"), help="metric of that table")
-@click.option("--wide", is_flag=True, help="print all metrics, with nulls and all alarm levels")
+@click.option("--wide", is_flag=True, help="print everything that there is")
 @alarm_options
 @click.option(
     "--alarm",
@@ -114,7 +114,7 @@ def show(options: Options) -> int:
     report = Report(
         records,
         intervals=options.intervals,
-        detail="full" if layout else "wide" if options.wide else "brief",
+        detail="full" if layout or options.wide else "brief",
         detector=options.detector or "",
         metric=options.metric or "",
         units=units,

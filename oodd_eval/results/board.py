@@ -245,10 +245,14 @@ class Board:
         )
         return first_mean, second_mean
 
-    def worst(self, entry: Setting) -> tuple[str, Value] | None:
-        """Return the environment in which an entry's mean is lowest, and that mean."""
-        means = [(e, self.of(entry, Column(self.ranking, "", [e]))) for e in self.environments]
-        defined = [(e, mean) for e, mean in means if not math.isnan(mean.value)]
+    def worst(self, entry: Setting, places: Sequence[Column] = ()) -> tuple[str, Value] | None:
+        """Return the title of the place where an entry's mean is lowest, and that mean.
+
+        Places are columns, by default one an environment.
+        """
+        places = places or [Column(self.ranking, e, [e]) for e in self.environments]
+        means = [(column.title, self.of(entry, column)) for column in places]
+        defined = [pair for pair in means if not math.isnan(pair[1].value)]
         return min(defined, key=lambda pair: pair[1].value, default=None)
 
     def failures(self) -> list[Record]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from html import escape
 from importlib import import_module
@@ -23,7 +22,7 @@ from oodd_eval.results.board import Conditions, boards, level_of
 from oodd_eval.results.directory import ResultsDirectory, ScoreFile
 from oodd_eval.results.evaluate import Rules, ScoredEpisode, must_be_of, stored_scores, with_stream
 from oodd_eval.results.identity import Setting
-from oodd_eval.results.record import STATUSES, Record
+from oodd_eval.results.record import Record, summary
 from oodd_eval.results.render import FORMATS
 from oodd_eval.results.report import Report, flat
 from oodd_eval.results.standings import PairedComparison, compare_rows, row_named
@@ -84,13 +83,13 @@ class Results(Sequence[Record]):
         """Return one line: how many cells of what, and how many failed."""
         splits = ", ".join(dict.fromkeys(r.split for r in self)) or "nothing"
         cells = counted(len(self), "cell(s)")
-        return f"Results({cells} of {splits}: {', '.join(self.rows)}; {self._states or 'none'})"
+        return f"Results({cells} of {splits}: {', '.join(self.rows)}; {summary(self)})"
 
     def __str__(self) -> str:
         """Return what ``oodd-eval show`` prints: why cells failed, and where one's row stands."""
         if not self.records:
             return repr(self)
-        failures = [*self._failures, self._states, ""] if self._failures else []
+        failures = [*self._failures, summary(self), ""] if self._failures else []
         return "\n".join([*failures, terminal_text(self._report.sections).rstrip("\n")])
 
     def _repr_html_(self) -> str:
@@ -103,12 +102,6 @@ class Results(Sequence[Record]):
     def _report(self) -> Report:
         units = self._split.units if self._split else NO_UNITS
         return Report(self.records, detail="brief", units=units)
-
-    @property
-    def _states(self) -> str:
-        """Return how many cells came to which status."""
-        counts = Counter(r.status for r in self)
-        return ", ".join(f"{counts[status]} {status}" for status in STATUSES if counts[status])
 
     @property
     def _failures(self) -> list[str]:

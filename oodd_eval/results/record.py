@@ -11,7 +11,8 @@ import math
 import platform
 import string
 import subprocess
-from collections.abc import Iterable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
@@ -516,3 +517,9 @@ def _cpu() -> str:
         lines = []
     names = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
     return next(names, "") or platform.processor() or platform.machine()
+
+
+def summary(records: Sequence[Record]) -> str:
+    """Return how many cells came to which status, such as ``48 ok, 8 timeout``."""
+    counts = Counter(r.status for r in records)
+    return ", ".join(f"{counts[s]} {s}" for s in STATUSES if counts[s]) or "no cells"

@@ -18,7 +18,7 @@ from oodd_eval.results.standings import verdict_of
 from oodd_eval.results.strengths import StrengthTables, thresholds
 from oodd_eval.results.tables import Tables
 
-Detail = Literal["brief", "wide", "full"]
+Detail = Literal["brief", "full"]
 
 _OF_PAPER: Final = [name for name, info in METRICS.items() if info.paper]
 _WITHOUT_ALARM: Final = [n for n, info in METRICS.items() if not (info.request or info.paper)]
@@ -36,9 +36,7 @@ class Report:
         Whether means have their 95 % intervals.
     detail
         ``"brief"`` is what a run prints at its end: the headline with a few notes, beside what is
-        asked for by `intervals`, `level`, `paper` and rows' metrics. ``"wide"`` adds means by
-        environment and group, by detector seed, and all metrics and levels of alarms; ``"full"``
-        also each row's cells and all failures.
+        asked for by `intervals`, `level`, `paper` and rows' metrics. ``"full"`` is everything.
     detector
         Name of a detector, for its cells alone.
     metric
@@ -87,14 +85,10 @@ class Report:
         for table in filter(None, self._tables(board)):
             if all((table.header, table.rows) != (t.header, t.rows) for t in distinct):
                 distinct.append(table)
-        title = f"Split {board.split}"
         if self.detail == "brief":
-            several = len(boards(self.records)) > 1
-            facts = f"Split {board.conditions}." if several or board.limit else ""
-            essentials = Tables(board, level=self.level).essentials(facts)
-            return Section(title, tables=distinct, notes=essentials, verdict=verdict)
+            return Section(f"Split {board.conditions}", tables=distinct, verdict=verdict)
         return Section(
-            title,
+            f"Split {board.split}",
             [f"Cells: {counts}."],
             findings_of(board, self.level),
             distinct,
@@ -104,26 +98,26 @@ class Report:
 
     def _tables(self, board: Board) -> Iterator[Table | None]:
         means = Tables(board, self.intervals, level=self.level)
-        full, brief = self.detail == "full", self.detail == "brief"
+        brief = self.detail == "brief"
         ranked = not board.leaves_out([board.ranking])
         headline = means.headline()
-        strengths = StrengthTables(board, self.intervals, self.units).overview(places=full)
+        strengths = StrengthTables(board, self.intervals, self.units).overview(places=not brief)
         if brief:
-            yield replace(headline, note="") if headline else next(iter(strengths), None)
+            yield headline or next(iter(strengths), None)
             yield means.published()
         else:
             yield headline
             yield from [] if board.paired else means.of_logs()
             yield from strengths
-            yield means.separability() if board.paired and ranked else None
+            yield means.separability() if ranked else None
             yield means.seeds()
             yield means.attribution()
             yield None if board.leaves_out(_WITHOUT_ALARM) else means.all_metrics()
             yield from means.all_alarms()
-        if board.paired and (full or self.paper):
+        if board.paired and (self.paper or not brief):
             yield None if board.leaves_out(_OF_PAPER) else means.papers()
             yield from means.anomaly_groups()
-        if full:
+        if not brief:
             # One figure stands above.
             if ranked and len(board.environments) * len(board.anomalies) > 1:
                 yield from map(means.by_anomaly, board.entries)
@@ -133,15 +127,8 @@ class Report:
         title = f"{self.detector} on split {board.split}"
         rows = [r for r in board.records if r.detector == self.detector]
         # The board may have a weaker level than the row alone, for its other rows.
-        level = self.level or board.level
-        verdict = verdict_of(Board(rows), level) if rows else ""
-        lowered = level != HEADLINE and not self.level
-        return Section(
-            title,
-            tables=list(self._tables_of_detector(board)),
-            notes=tables.lowered_level(board, HEADLINE, level) if lowered else (),
-            verdict=verdict,
-        )
+        verdict = verdict_of(Board(rows), self.level or board.level) if rows else ""
+        return Section(title, tables=list(self._tables_of_detector(board)), verdict=verdict)
 
     def _tables_of_detector(self, board: Board) -> Iterator[Table]:
         for entry in (e for e in board.entries if e.detector == self.detector):

@@ -287,14 +287,11 @@ def verdict_of(board: Board, level: str = "") -> str:
     if len(board.entries) > len(band):
         place += f" {'rows that learn from failures' if own in board.supervised else 'ranked rows'}"
     means = [board.of(row, Column(metric)) for row in (own, rival)]
-    if means[0].state:
-        statuses = [r.status for r in board.records if r.setting == own]
-        failed = sum(status != "ok" for status in statuses)
-        cells = counted(len(statuses), "cell(s)")
-        return f"{own} has no place: {means[0].state} in {failed} of {cells}."
     try:
         test = compare_rows([r for r in board.records if r.ok], str(own), str(rival), metric)
     except ResultsError:  # without a cell in common
+        if means[0].state:
+            return f"{own} has no place: {means[0].state}."
         return "" if math.isnan(means[0].value) else f"{place}."
     ahead = "ahead of" if test.first_is_better else "behind"
     scope = f" in {metric_info(metric).phrase}"

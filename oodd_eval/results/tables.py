@@ -169,129 +169,65 @@ class Tables:
         environment a column an anomaly), and found, missed and false episodes of guaranteed alarms.
         Where it is too wide, the worst anomaly stands for all. None when no record has any of them.
         """
-        board, first, alarms = self.board, self._first, self._alarms_first
-        if not first and not alarms:
-            return None
-        places = self._places if first else []
-        title = " and ".join(
-            [metric_info(board.ranking).title] * bool(first)
-            + [f"guaranteed alarms at {percent_of(self.suffix)}"] * bool(alarms)
-        )
-        outcomes = board.ranking == OUTCOME
-        note = _joined(
-            self._promise(alarms), self._outcome_note() if outcomes else "", unranked(board)
-        )
-        title = f"{title[0].upper()}{title[1:]} (%)"
-        of_kinds = bool(places) and not places[0].environments
-        kinds = places if of_kinds and len(places) <= len(TABLE1) else []
-        whole = replace(self.table(title, [*first, *kinds, *alarms], note), whole=True)
-        if not places:
-            return whole
-        shorter = (
-            replace(self.table(title, [*first, *alarms], note), whole=True) if kinds else whole
-        )
-        cells = [self._worst(entry, places) for entry in self.order]
-        heading = "worst anomaly" if of_kinds else WORST
-        for row, text in zip((shorter.header, *shorter.rows), (heading, *cells), strict=True):
-            row.insert(shorter.labels + 1, text)
-        return replace(whole, narrower=[shorter]) if kinds else shorter
-
-    @functools.cached_property
-    def _first(self) -> list[Column]:
-        """The metric that ranks; none where records leave it out."""
         board, metric = self.board, self.board.ranking
         lacking = board.leaves_out([metric]) if board.paired else not self._present([metric])
-        return [] if lacking else [Column(metric, _heading(metric), intervals=True)]
+        first = [] if lacking else [Column(metric, _heading(metric), intervals=True)]
+        alarms = self.columns(self._at_level(*(_OUTCOMES if metric == OUTCOME else _FIRST)))
+        if not first and not alarms:
+            return None
+        compared = [e for e in board.environments if self._present([metric], [e])]
+        places, several = [Column(metric, e, [e]) for e in compared], len(compared) > 1
+        if not several:
+            places = [Column(metric, k, anomalies=[k]) for k in board.anomalies]
+            places = [column for column in places if cells_with(metric, self._of(column.title))]
+        titles = [metric_info(metric).title] * bool(first)
+        titles += [f"guaranteed alarms at {percent_of(self.suffix)}"] * bool(alarms)
+        title = f"{' and '.join(titles)} (%)"
+        one_each = [] if several or not 1 < len(places) <= len(TABLE1) else places
+        note = "\n".join(self._essentials(first, places, alarms)[:MOST_NOTES])
+        wide, short = (
+            replace(self.table(title[0].upper() + title[1:], columns), note=note, whole=True)
+            for columns in ([*first, *one_each, *alarms], [*first, *alarms])
+        )
+        if first and len(places) > 1:
+            worst = [board.worst(entry, places) or ("", Value()) for entry in self.order]
+            cells = [f"{place} {show_value(mean, metric)}".strip() for place, mean in worst]
+            cells.insert(0, WORST if several else "worst anomaly")
+            for row, text in zip((short.header, *short.rows), cells, strict=True):
+                row.insert(short.labels + 1, text)
+        return replace(wide, narrower=[short]) if one_each else short
 
-    @functools.cached_property
-    def _alarms_first(self) -> list[Column]:
-        """The columns of guaranteed alarms that stand first everywhere."""
-        names = _OUTCOMES if self.board.ranking == OUTCOME else _FIRST
-        return self.columns(self._at_level(*names))
-
-    @functools.cached_property
-    def _places(self) -> list[Column]:
-        """The metric that ranks by environment, or of one environment by anomaly, if several."""
-        board, metric = self.board, self.board.ranking
-        environments = [e for e in board.environments if self._present([metric], [e])]
-        if len(environments) != 1:
-            return [Column(metric, e, [e]) for e in environments]
-        kinds = [k for k in board.anomalies if cells_with(metric, self._of(k))]
-        return [Column(metric, k, anomalies=[k]) for k in kinds] if len(kinds) > 1 else []
-
-    def essentials(self, facts: str = "") -> list[str]:
-        """Return what has to be known to read the headline, at most `MOST_NOTES` sentences.
-
-        Parameters
-        ----------
-        facts
-            What comes before all: of which part of a split the figures are.
-        """
-        metric, graded = self.board.ranking, _has_strengths(self.board)
-        notes = [
-            _joined(facts, "Means are over all strengths." * graded),
-            self._legend(),
-            self._promised(),
-            f"{metric_info(metric).title}: {_MEANINGS[metric]}; 50 is chance." * bool(self._first),
-            _FOUND * any(column.metric.startswith("missed") for column in self._alarms_first),
-        ]
-        return [f"{note[0].upper()}{note[1:]}" for note in notes if note][:MOST_NOTES]
-
-    def _legend(self) -> str:
-        """Return what the marks in the headline mean, in one sentence."""
-        board, columns = self.board, [*self._first, *self._places, *self._alarms_first]
-        cells = {text for entry in self.order for text in texts(board, entry, columns)}
-        undefined = ", ".join(_lacking(board, self.order, columns))
-        marks = {
-            "*": "over fewer cells than the split has",
-            BRIEF: "half of the episodes end within 20 rows",
-            UNDEFINED: undefined or "undefined",
-        }
-        legend = [f"{mark}: {text}" for mark, text in marks.items() if mark in "".join(cells)]
-        lacking = {text for r in board.records if (text := unpromised(r, self.suffix))}
-        legend += [f"{UNPROMISED}: {text}" for text in sorted(lacking)]
+    def _essentials(
+        self, first: Sequence[Column], places: Sequence[Column], alarms: Sequence[Column]
+    ) -> list[str]:
+        """Return what has to be known to read the headline, the most important first."""
+        board, metric, usual = self.board, self.board.ranking, self.level or catalogue.HEADLINE
+        text = " ".join(t for e in self.order for t in texts(board, e, [*first, *places, *alarms]))
+        undefined = ", ".join(_lacking(board, self.order, [*first, *alarms])) or "undefined"
+        legend = [f"{mark}: {why}" for mark, why in _MARKS.items() if mark in text]
+        legend += [f"{UNDEFINED}: {undefined}"] * (UNDEFINED in text)
+        promises = {unpromised(r, self.suffix) for r in board.records if r.ok}
+        legend += [f"{UNPROMISED}: {why}" for why in sorted(promises) if why]
         legend += [f"{SUPERVISED}: learns from failures"] * bool(board.supervised)
-        others = [r for r in board.records if r.training not in ("nominal", "failures")]
-        knowing = ", ".join(dict.fromkeys(str(r.setting) for r in others))
-        legend += [f"not ranked, for what they know: {knowing}"] * bool(knowing)
-        return f"{'; '.join(legend)}." if legend else ""
-
-    def _promised(self) -> str:
-        """Return what false episodes are, and what is promised of them, or why there are none."""
-        usual = self.level or catalogue.HEADLINE
-        if not self._alarms_first:
-            return _joined(*missing_level(self.board, usual))
-        if not any(r.ok and not unpromised(r, self.suffix) for r in self.board.records):
-            return f"{_FALSE}; no share of them is promised."
-        few = _lacking(self.board, self.order, [Column(f"false_episodes_{usual}")])
-        why = f" ({', '.join(few)})" * (self.suffix != usual)
-        return f"{_FALSE}; the threshold promises at most {percent_of(self.suffix)}{why}."
+        knowing = {str(r.setting): None for r in board.records if r.training not in _RANKED}
+        legend += [f"not ranked, for what they know: {', '.join(knowing)}"] * bool(knowing)
+        few = next(iter(_lacking(board, self.order, [Column(f"false_episodes_{usual}")])), "")
+        promise = "; no share of them is promised"
+        if "" in promises:
+            promise = f"; the threshold promises at most {percent_of(self.suffix)}"
+            promise += f" ({few.partition(',')[0]})" * (self.suffix != usual)
+        notes = [
+            f"The first {counted(board.limit or 0, _PART)}: for trying." * bool(board.limit),
+            f"{'; '.join(legend)}." * bool(legend),
+            f"{_FALSE}{promise}." if alarms else _joined(*missing_level(board, usual)),
+            f"{metric_info(metric).title}: {_MEANINGS[metric]}; 50 is chance." * bool(first),
+            "Means are over all strengths." * _has_strengths(board),
+            _FOUND * any(column.metric.startswith("missed") for column in alarms),
+        ]
+        return [f"{note[0].upper()}{note[1:]}" for note in notes if note]
 
     def _of(self, anomaly: str) -> list[Record]:
         return [r for r in self.board.records if r.anomaly == anomaly]
-
-    def _worst(self, entry: Setting, places: Iterable[Column]) -> str:
-        """Return the place in which a row's mean is lowest, and that mean."""
-        means = [(self.board.of(entry, column), column.title) for column in places]
-        defined = [mean for mean in means if not math.isnan(mean[0].value)]
-        value, name = min(defined, key=lambda mean: mean[0].value, default=(Value(), ""))
-        return f"{name} {show_value(value, self.board.ranking)}" if name else ""
-
-    def _promise(self, columns: Iterable[Column]) -> str:
-        """Return what a table of guaranteed alarms promises, and which level stands for another."""
-        names, asked = [column.metric for column in columns], self.level or catalogue.HEADLINE
-        episodes = "nominal twins" if self.board.paired else "nominal test episodes"
-        is_kept = any(r.ok and not unpromised(r, self.suffix) for r in self.board.records)
-        promised = f"an alarm in at most {percent_of(self.suffix)} of nominal episodes"
-        promise = (
-            f"The threshold promises {promised if is_kept else 'nothing'}; "
-            f"false episodes is the share of this split's {episodes} that raised "
-            f"{'one' if is_kept else 'an alarm'}."
-        )
-        lowered = lowered_level(self.board, asked, self.suffix)
-        return _joined(
-            promise * bool(names), *(lowered if f"false_episodes_{asked}" not in names else ())
-        )
 
     @functools.cached_property
     def suffix(self) -> str:
@@ -301,13 +237,16 @@ class Tables:
         strictest = usual if usual in levels or not levels else levels[-1]
         return self.level or strictest.removeprefix("false_episodes_")
 
-    def separability(self) -> Table:
-        """Return matched AUC by anomaly group and by environment."""
-        board = self.board
-        columns = by_group(board, "mean")
-        columns += [Column(board.ranking, name, [name]) for name in board.environments]
-        title = "Separability: matched AUC (%), higher is better. The leaderboard ranks by this."
-        return self.table(title, self._with_ends(columns), unranked(board))
+    def separability(self) -> Table | None:
+        """Return the metric that ranks by anomaly group and by environment; None without any."""
+        board, metric = self.board, self.board.ranking
+        compared = [e for e in board.environments if self._present([metric], [e])]
+        places = [Column(metric, e, [e]) for e in compared * (board.paired or len(compared) > 1)]
+        columns = [*by_group(board, "mean"), *places]
+        title = metric_info(metric).title
+        title = f"{title[0].upper()}{title[1:]} (%) by group and environment"
+        enough = bool(compared) and len(columns) > 1
+        return self.table(title, self._with_ends(columns), unranked(board)) if enough else None
 
     def all_alarms(self) -> list[Table]:
         """Return guaranteed alarms at every level that records have, with their nulls."""
@@ -324,7 +263,7 @@ class Tables:
         hourly = f"{metric_info(hours).noun}, " * (hours in names)
         steps = "delays in steps, " * any(metric_info(name).unit == "steps" for name in names)
         units = f"{steps}{hourly}the rest in %" if steps or hourly else "%"
-        note = _joined(self._promise(columns), CENSORED * ({*censored} <= {*names}))
+        note = CENSORED if {*censored} <= {*names} else ""
         title = f"Guaranteed alarms at {percent_of(self.suffix)} ({units})"
         return self.table(title, columns, note)
 
@@ -418,80 +357,30 @@ class Tables:
         Each of several environments has a table of its own.
         """
         environments = self.board.environments
-        single = environments if len(environments) > 1 else []
-        candidates = [self._alarms(), self._outcomes(), self._nominal(), self._apart()]
-        candidates += [self._alarms([name]) for name in single]
-        return [table for table in (*candidates, self.published()) if table]
+        places = [(), *([name] for name in environments if len(environments) > 1)]
+        candidates = [*map(self._figures, places), self.published()]
+        return [table for table in candidates if table]
 
     def published(self) -> Table | None:
         """Return metrics of rows as published tables have them; None when no record has any."""
-        return self._of_logs(_PUBLISHED, ROWS) if self._present(ROWS) else None
+        return self._of_logs(_PUBLISHED, ROWS)
 
-    def _alarms(self, environments: Sequence[str] = ()) -> Table | None:
-        """Return separability and guaranteed alarms side by side; None without anomalous rows."""
-        alarms = self._at_level(*_ALARMS_OF_LOGS)
-        if not self._present((POOLED[-1], alarms[0]), environments):
-            return None
-        title = "Separability (%, higher is better)"
-        title += " and guaranteed alarms" * bool(self._present(alarms, environments))
-        note = CENSORED if self._present(self._at_level("delay_censored")) else ""
-        if not environments:
-            first = {_heading(name): name for name in self._present((*POOLED[:2], alarms[0]))}
-            note = _joined(explained(first), note)
-        return self._of_logs(title, (*POOLED, *alarms), environments, note)
-
-    def _outcomes(self) -> Table | None:
-        """Return what is found of episodes known by their outcome alone; None without any."""
-        if not self._present([OUTCOME]):
-            return None
-        names = [*OUTCOME_UP_TO, *self._at_level(*ALARMS_OF_OUTCOMES), BRIER]
-        if self._alarms() is None:
-            names += [*POOLED, *self._at_level(*_NOMINAL)]
-        brier = {_heading(name): name for name in self._present([BRIER])}
-        note = _joined(self._outcome_note(), explained(brier))
-        return self._of_logs("Episodes known by their outcome alone (%)", names, note=note)
-
-    def _outcome_note(self) -> str:
-        """Return what the AUC of outcomes compares, and how to see what the time alone gives."""
-        if any(entry.detector == CLOCK for entry in self.board.entries):
-            return _SAME_ROW
-        return (
-            f"{_SAME_ROW} Add the row {CLOCK} (--detector ...,{CLOCK}) to see how much of this the "
-            "phase of the episode alone gives."
+    def _figures(self, environments: Sequence[str]) -> Table | None:
+        """Return all figures of scores and guaranteed alarms, of all environments or of some."""
+        alarms = self._at_level(*_ALARMS_OF_LOGS, *ALARMS_OF_OUTCOMES)
+        said = self._present((*POOLED[:2], alarms[0], BRIER), environments)
+        note = _joined(
+            explained({_heading(name): name for name in said}),
+            CENSORED * bool(self._present(self._at_level("delay_censored"), environments)),
+            _SAME_ROW * bool(self._present([OUTCOME], environments)),
         )
-
-    def _nominal(self) -> Table | None:
-        """Return alarms in the environments that have nominal test episodes alone; else None."""
-        names, judged = self._at_level(*_NOMINAL), (*POOLED, OUTCOME)
-        alone = [e for e in self.board.environments if not self._present(judged, [e])]
-        if not alone or not self._present(names, alone):
-            return None
-        some = alone if alone != self.board.environments else ()
-        return self._of_logs("Alarms on nominal test episodes alone", names, some)
-
-    def _apart(self) -> Table | None:
-        """Return the metric that ranks by environment and group; None where there is only one."""
-        board, metric = self.board, self.board.ranking
-        compared = [e for e in board.environments if self._present([metric], [e])]
-        places = [Column(metric, e, [e]) for e in compared] if len(compared) > 1 else []
-        columns = self._with_ends([*places, *by_group(board, "")[1:]])
-        if not columns or not compared:
-            return None
-        by = " and ".join(["environment"] * bool(places) + ["group"] * bool(board.groups))
-        title = metric_info(metric).title
-        entries = self.order
-        table = self.table(f"{title[0].upper()}{title[1:]} (%) by {by}", columns, "", entries)
-        if places:
-            means = [show_value(_mean(board, entry, places), metric) for entry in entries]
-            for row, text in zip((table.header, *table.rows), ("mean", *means), strict=True):
-                row.insert(table.labels, text)
-            table = replace(table, note="The mean is that of the environments, each counting once.")
-        return table
+        names = (*POOLED, *OUTCOME_UP_TO, *alarms, BRIER)
+        return self._of_logs("Scores and alarms (%, but for steps)", names, environments, note)
 
     def _of_logs(
         self, title: str, names: Iterable[str], environments: Sequence[str] = (), note: str = ""
-    ) -> Table:
-        """Return means of the metrics that the board has."""
+    ) -> Table | None:
+        """Return means of the metrics that the board has; None without any."""
         suffix, columns = self.suffix, []
         for info in map(metric_info, self._present(names, environments)):
             text = _heading(info.name) + " (steps)" * (info.unit == "steps")
@@ -499,10 +388,7 @@ class Tables:
             columns.append(Column(info.name, text, environments))
         title += f" at {percent_of(suffix)}" * any(metric_info(c.metric).level for c in columns)
         title += f": {', '.join(environments)}" * bool(environments)
-        asked = self.level or catalogue.HEADLINE
-        if f"false_episodes_{asked}" not in [c.metric for c in columns]:
-            note = _joined(note, *lowered_level(self.board, asked, suffix))
-        return self.table(title, self._with_ends(columns), note)
+        return self.table(title, self._with_ends(columns), note) if columns else None
 
     @functools.cached_property
     def order(self) -> list[Setting]:
@@ -534,13 +420,15 @@ class Tables:
         """Return columns with a row per detector, by default all in the order of the tables."""
         rows = entries or self.order
         cells = [[*self.label(e), *texts(self.board, e, columns)] for e in rows]
-        lacking = [_unpromised(self.board, c) for c in columns]
-        marks = (UNPROMISED if sentences else "" for sentences in lacking)
-        header = [*self.label_names, *(c.title + m for c, m in zip(columns, marks, strict=True))]
-        promises = dict.fromkeys(itertools.chain(*lacking))
-        band = _BAND * any(e in self.board.supervised and e not in self.labels for e in rows)
-        note = _joined(note, *promises, band, *reasons(self.board, rows, columns))
+        header = [*self.label_names, *(c.title + self._mark(c) for c in columns)]
+        note = _joined(note, *reasons(self.board, rows, columns))
         return Table(title, header, cells, len(self.label_names), note)
+
+    def _mark(self, column: Column) -> str:
+        """Return the mark of a column of alarms whose level promises nothing in some row."""
+        suffix = f"at_{column.metric.rpartition('_at_')[2]}"
+        cells = [r for r in self.board.records if r.environment in column.environments]
+        return UNPROMISED * any(unpromised(r, suffix) for r in cells or self.board.records)
 
 
 _TABLE_5: Final = ("auc", "delay", "far")
@@ -553,13 +441,20 @@ _MEANINGS: Final = {
     POOLED[0]: "how often anomalous rows score above nominal ones",
     OUTCOME: "how often a failure scores above a success",
 }
-_SAME_ROW: Final = "Episodes are compared up to the same row, as failures run into the time limit."
+_SAME_ROW: Final = (
+    "Episodes are compared up to the same row, as failures run into the time limit. The row clock "
+    "shows how much of this the phase of the episode alone gives."
+)
+_MARKS: Final = {
+    "*": "over fewer cells than the split has",
+    BRIEF: "half of the episodes end within 20 rows",
+}
+_RANKED: Final = ("nominal", "failures")  # what rows that are ranked, or in a band, learn from
+_PART: Final = "trajector(y/ies) of each part"
 _FIXED: Final = (
     "Detector seeds are fixed: intervals are over test episodes and calibration episodes, and say "
     "nothing of further seeds."
 )
-_BAND: Final = f"{SUPERVISED} trained on failures: a band of its own, below the others."
-_NOMINAL: Final = ("false_episodes", "false_alarms_per_hour")
 _PUBLISHED: Final = "Metrics of rows, for comparison with published tables; they rank nothing"
 _ATTRIBUTION: Final = (
     "Of the detectors that explain their scores, at the first guaranteed alarm: how often the "
@@ -603,18 +498,6 @@ def ordering_metric(board: Board) -> str:
     """
     share_found = f"found_within_{catalogue.FOUND_WITHIN[-1]}_{board.level}"
     return share_found if board.leaves_out([board.ranking]) else board.ranking
-
-
-def _mean(board: Board, entry: Setting, columns: Sequence[Column]) -> Value:
-    """Return a row's mean of columns, each counting once."""
-    means = [board.of(entry, column) for column in columns]
-    defined = [mean for mean in means if mean.state or not math.isnan(mean.value)]
-    return Value(
-        nan_mean(mean.value for mean in defined),
-        state=next((mean.state for mean in defined if mean.state), ""),
-        cells=sum(mean.cells for mean in means),
-        partial=0 < len(defined) < len(means) or any(mean.partial for mean in defined),
-    )
 
 
 def _heading(name: str) -> str:
@@ -661,32 +544,6 @@ def unpromised(record: Record, suffix: str) -> str:
     if f"false_episodes_{suffix}" not in record.metrics:
         return ""
     return no_promise(len(numbers), len({*numbers}), catalogue.LEVELS[suffix], record.alarm)
-
-
-def _unpromised(board: Board, column: Column) -> list[str]:
-    """Return which promises a column of alarms lacks, a sentence for each reason."""
-    suffix = f"at_{column.metric.rpartition('_at_')[2]}"
-    environments = [
-        e for e in board.environments if not column.environments or e in column.environments
-    ]
-    rows: dict[tuple[str, str], dict[str, None]] = {}
-    for r in board.records:
-        text = unpromised(r, suffix) if r.environment in environments else ""
-        rows.setdefault((r.environment, text), {})[str(r.setting)] = None
-    several = len(rows) > 1
-    return [
-        UNPROMISED + f" {environment}, {_listed(of_text, 'rows')}:" * several + f" {text}."
-        for (environment, text), of_text in rows.items()
-        if text
-    ]
-
-
-def lowered_level(board: Board, asked: str, level: str) -> list[str]:
-    """Return which rows have no figures at a level, and that another stands for all rows."""
-    lacking = missing_level(board, asked)
-    if level != asked and lacking:
-        lacking.append(f"So all rows are shown at {percent_of(level)}.")
-    return lacking
 
 
 def unranked(board: Board) -> str:

@@ -186,7 +186,7 @@ def test_reports_and_the_terminal_have_the_tables_where_there_are_strengths():
         assert title not in shown.getvalue()
     (section,) = Report(RECORDS, detail="brief").sections
     assert section.tables[0].header[:2] == ["detector", "matched AUC"]
-    assert "all strengths" in section.notes[0]
+    assert "all strengths" in section.tables[0].note
     # Where records keep the share that is found alone, thresholds are what there is.
     kept = [
         dataclasses.replace(r, **{n: {DETECTION: getattr(r, n)[DETECTION]} for n in FIGURES})

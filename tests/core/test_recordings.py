@@ -279,9 +279,9 @@ def test_figures_without_a_promise_are_marked_everywhere(tmp_path):
     table = Tables(board).headline()
     assert f"missed{UNPROMISED}" in table.header
     assert "pooled AUC" in table.header
-    assert f"{UNPROMISED} {words} 5 %; " in table.note
-    assert "The threshold promises nothing; " in table.note
-    assert f"{UNPROMISED} {words}" in " ".join(str(Report(records)).split())
+    assert f"{UNPROMISED}: {words} 5 %; " in table.note
+    assert "no share of them is promised" in table.note
+    assert f"{UNPROMISED}: {words}" in " ".join(str(Report(records)).split())
     assert words in flat(records)[0]["promise"]
     assert flat(unmarked)[0]["promise"] == ""
     again = load_results(tmp_path / "out").records

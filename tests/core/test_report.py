@@ -22,7 +22,7 @@ from oodd_eval.data.facts import TABLE1
 from oodd_eval.metrics.bootstrap import bounds, drawn_cell, sample_cells
 from oodd_eval.metrics.catalogue import PAPER
 from oodd_eval.metrics.recalibration import PairedScores
-from oodd_eval.prose import Table, print_prose, print_table
+from oodd_eval.prose import Table, print_prose, print_sections, print_table
 from oodd_eval.results import tables
 from oodd_eval.results.board import Board, boards, contribution
 from oodd_eval.results.comparison import write_reference
@@ -55,7 +55,7 @@ def cells(table, row):
 
 TITLES = {  # by the start of a title: columns of labels, and one number: row, column, text
     "Matched AUC and guaranteed alarms at 5 % (%)": (1, "riqn", "worst environment", "ant 67.5"),
-    "Separability": (1, "riqn", "mean", "67.5"),
+    "Matched AUC (%) by group and environment": (1, "riqn", "mean", "67.5"),
     "Guaranteed alarms at 5 % (delays in steps": (1, "riqn", "delay if found", "8.0"),
     f"{PAPER} (delays in steps, the rest as shares)": (1, "riqn", "delay", "3.2"),
     f"{PAPER}. AUC (%), delay (steps), false-alarm rate (FAR), sen": (2, "Hopper", "AVG", "85.0"),
@@ -84,7 +84,7 @@ def test_markdown_has_every_table_with_its_columns_and_numbers():
         assert row[header.index(column)] == number, start
     intervals = markdown_tables(rendered(example(), intervals=True))
     # The seed's two trajectories: 0.7 in both of iid, 0.6 and 0.7 of gravity.
-    row = next(t for title, t in intervals.items() if title.startswith("Separability"))[2]
+    row = next(t for title, t in intervals.items() if title.startswith("Matched AUC (%) by"))[2]
     assert re.fullmatch(r"67\.5 \\\[6\d\.\d, (67\.5|[67]\d\.\d)\]", row[1])
     assert "No records" in rendered([])
 
@@ -158,7 +158,7 @@ def test_show_prints_every_format(name, tmp_path, capsys):
     assert main(["show", str(tmp_path), "--stored", f"--{name}"]) == 1  # a cell failed
     assert capsys.readouterr().out == rendered(example(), name)
     assert main(["show", str(tmp_path), "--stored", "--detector", "rf", f"--{name}"]) == 1
-    assert name in ("csv", "json") or "Separability" not in capsys.readouterr().out
+    assert name in ("csv", "json") or "by group and" not in capsys.readouterr().out
 
 
 def test_sentences_on_the_terminal_are_wrapped_without_spaces_at_their_ends(capsys):
@@ -486,7 +486,7 @@ def test_rows_that_failed_or_know_more_than_nominal_episodes_are_no_rivals():
     # A row that failed has no place.
     theirs = own("jumps", status="error", reason="no mood")
     text = verdict_of(Board([*rows(**values), theirs, own("jumps", anomaly="drift")]))
-    assert text.startswith("jumps has no place: error in 1 of 2 cells")
+    assert text == "jumps has no place: error."
     # One that lacks a cell is compared over what both have, and said to be.
     more = [*rows(**values), *(r for d in values for r in [make_record(d, "ant", values=FLAT)])]
     text = verdict_of(Board([*more, own("jumps", values={"auc_matched": [0.9] * 12})]))
@@ -510,18 +510,21 @@ def calibrated(detector, episodes, alarm="cusum", level="5", environment="hopper
 def test_a_level_that_calibration_episodes_are_too_few_for_is_named():
     # A CUSUM standardizes with half of them: 2 x 19 are needed at 5 %, 2 x 9 at 10 %.
     few, strict = calibrated("rf", 30, level="10"), calibrated("pe", 40)
-    assert "rf: guaranteed alarms at 5 % (30" in Tables(Board([few])).headline().note
+    assert "at most 10 % (30 calibration episodes; 38 " in Tables(Board([few])).headline().note
     mixed = Board([few, calibrated("pe", 30, "score")])
     table = Tables(mixed).headline()
     assert "at 5 %" in table.title
     assert [cells(table, 1)[name] for name in ("missed", "false episodes")] == ["\N{EN DASH}"] * 2
-    assert "Undefined for rf: missed, false episodes (30" in table.note
+    assert "\N{EN DASH}: 30 calibration episodes; 38 needed" in table.note
+    assert "Undefined for rf: false episodes, early, missed (30" in (
+        Tables(mixed).all_alarms()[-1].note
+    )
     (section,) = Report([few], level="at_10pct").sections
     chosen = next(t for t in section.tables if "Guaranteed" in t.title)
     assert ("at 10 %" in chosen.title, "calibration" in chosen.note) == (True, False)
     (section,) = Report([strict], level="at_1pct", detail="brief").sections
     assert not [t for t in section.tables if "Guaranteed" in t.title]
-    assert any("pe: guaranteed alarms at 1 % (40" in text for text in section.notes)
+    assert "pe: guaranteed alarms at 1 % (40" in section.tables[0].note
     (section,) = Report([strict], level="at_1pct").sections
     assert any("pe: guaranteed alarms at 1 % (40" in text for text in section.findings)
     # Without any level there is no table, and the report says why.
@@ -691,21 +694,23 @@ def test_a_run_ends_with_one_table_and_at_most_three_notes():
     for records in (example(), several, [replace(r, limit=3) for r in several], five_columns()):
         (section,) = Report(records, detail="brief").sections
         assert len(section.tables) == 1
-        assert not section.tables[0].note
         assert not section.findings
-        assert 1 <= len(section.notes) <= 3
+        assert not section.notes
+        assert 1 <= len(section.tables[0].note.splitlines()) <= 3
     (section,) = Report([replace(r, limit=3) for r in several], detail="brief").sections
-    assert "limit 3" in section.notes[0]
-    assert "*: " in section.notes[1]
-    assert "oracle" in section.notes[1]
+    notes = section.tables[0].note.splitlines()
+    assert "first 3 trajectories" in notes[0]
+    assert "*: " in notes[1]
+    assert "oracle" in notes[1]
     # All of it is in the report of the run.
     text = rendered(several)
     assert "has a higher mean" in text
     assert "Undefined for" in text
     assert "FAR" in text
-    wide = Report(several, detail="wide").sections[0]
-    assert len(wide.tables) > 3
-    assert wide.findings
+    # Sections of several splits say which they are of.
+    shown = console()
+    print_sections(Report([*example(), make_record(digest="cd" * 32)]).sections, shown)
+    assert shown.file.getvalue().count("Split mini\n") == 2
 
 
 def test_names_of_others_are_not_taken_for_markup():

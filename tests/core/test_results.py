@@ -261,7 +261,7 @@ def test_a_text_of_results_is_what_the_terminal_shows(tiny_split, tmp_path, caps
     for same in (results, load_results(tmp_path / "out", tiny_split)):
         assert printed.startswith(f"{same}\n\neverything else: ")
         assert repr(same) == f"Results(4 cells of {same[0].split}: range, clock; 4 ok)"
-    assert str(results[:0]) == repr(results[:0]) == "Results(0 cells of nothing: ; none)"
+    assert str(results[:0]) == repr(results[:0]) == "Results(0 cells of nothing: ; no cells)"
     failed = replace(results[0], status="error", reason="no mood", metrics={})
     lines = str(Results([failed, results[1]])).splitlines()
     assert lines[:2] == [f"error: {failed.cell}: no mood", "1 ok, 1 error"]

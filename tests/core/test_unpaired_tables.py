@@ -89,8 +89,16 @@ def two_environments(**more):
 
 def table_titled(records, start, detail="brief"):
     report = Report(records, detail=detail)
-    (table,) = [t for s in report.sections for t in s.tables if t.title.startswith(start)]
+    whole = start == ALL
+    (table,) = [
+        t for s in report.sections for t in s.tables
+        if (t.title == start if whole else t.title.startswith(start))
+    ]  # fmt: skip
     return table
+
+
+BY = "Pooled AUC (%) by group and environment"
+ALL = "Scores and alarms (%, but for steps) at 5 %"
 
 
 def column(table, name):
@@ -105,19 +113,17 @@ def test_the_headline_has_its_columns_in_order_and_those_that_no_record_has_are_
     assert front.header == ["detector", "pooled AUC", "worst environment", "missed",
                             "false episodes"]  # fmt: skip
     assert [row[2] for row in front.rows] == ["press 55.0", "arm 50.0", "arm 50.0"]
-    (section,) = Report(two_environments(), detail="wide").sections
-    table = next(t for t in section.tables if t.title.startswith("Separability"))
+    table = table_titled(two_environments(), ALL, "full")
     assert table.header == [
         "detector", "pooled AUC", "null", "AUC of rows", "events found", "delay censored (steps)",
         "found within 100", "missed", "false episodes (≤ 5 %)", "early", "false alarms per hour",
     ]  # fmt: skip
-    assert table.title.endswith("at 5 %")
     assert [row[0] for row in table.rows] == ["mewma", "clock", "rf"]
     assert column(table, "pooled AUC") == {"mewma": "66.7", "rf": "50.0", "clock": "50.0"}
     assert re.fullmatch(r"16\.7 \[\d.*, \d.*\]", column(table, "false episodes (≤ 5 %)")["rf"])
     fewer = labelled(0.5, 0.6)
     del fewer["false_alarms_per_hour_at_5pct"]
-    header = table_titled([log_record("rf", values=fewer)], "Separability", "wide").header
+    header = table_titled([log_record("rf", values=fewer)], ALL, "full").header
     assert header == [name for name in table.header if "hour" not in name]
 
 
@@ -128,8 +134,8 @@ def test_ten_percent_is_shown_and_ranks_where_five_is_not_offered():
     ]
     board = Board(records)
     assert (board.ranking, board.alarm_ranking) == ("auc_pool", "delay_censored_at_10pct")
-    table = table_titled(records, "Pooled AUC and guaranteed alarms at 10 %", "wide")
-    assert "mewma, rf: guaranteed alarms at 5 % (30 calibration episodes" in table.note
+    table = table_titled(records, "Pooled AUC and guaranteed alarms at 10 %", "full")
+    assert "at most 10 % (30 calibration episodes; 38 needed at 5 %)" in table.note
     assert not [text for text in findings_of(board) if "calibration" in text]
     # One row with a statistic that takes half as many episodes does not leave the others blank.
     both = labelled(0.7, 0.6) | labelled(0.7, 0.6, "at_10pct")
@@ -140,16 +146,15 @@ def test_ten_percent_is_shown_and_ranks_where_five_is_not_offered():
     for level in ("", "at_5pct"):
         (section,) = Report([*records, one], detector="pe", level=level).sections
         assert section.verdict.startswith("pe on arm: pooled AUC 70.0 %, missed 25.0 %")
-        assert bool(section.notes) == (not level)
     strict = Report(records, level="at_1pct").sections[0].tables[0]
     assert strict.title == "Pooled AUC (%)"
 
 
-def test_environments_stand_apart_and_count_once_in_their_mean():
-    table = table_titled(two_environments(), "Pooled AUC (%) by environment", "wide")
+def test_environments_and_groups_stand_apart():
+    table = table_titled(two_environments(), BY, "full")
     assert table.header == ["detector", "mean", "arm", "press"]
-    assert table.rows[0] == ["mewma", "72.5", "90.0", "55.0"]  # and 66.7 over cells
-    wide = Report(two_environments(), detail="wide").sections[0].tables
+    assert table.rows[0] == ["mewma", "66.7", "90.0", "55.0"]
+    wide = Report(two_environments(), detail="full").sections[0].tables
     assert {t.title.rpartition(": ")[2] for t in wide} >= {"arm", "press"}
     one = [r for r in two_environments() if r.environment == "arm"]
     # One environment has no such table, one group no column, and one anomaly no table of them.
@@ -157,12 +162,12 @@ def test_environments_stand_apart_and_count_once_in_their_mean():
     assert not [title for title in single if "by anomaly" in title]
     for records in (one, [replace(r, group="dynamics") for r in one]):
         titles = [t.title for t in Report(records).sections[0].tables]
-        assert not [title for title in titles if "by environment" in title or "group" in title]
+        assert not [title for title in titles if title.startswith(BY)]
     groups = {"jam": "sensor", "leak": "dynamics"}
     grouped = [replace(r, group=groups.get(r.anomaly, "")) for r in two_environments()]
     assert Board(grouped).groups == {"sensor": ["jam"], "dynamics": ["leak"]}
-    header = table_titled(grouped, "Pooled AUC (%) by", "wide").header
-    assert header[2:] == ["arm", "press", "sensor", "dynamics"]
+    header = table_titled(grouped, BY, "full").header
+    assert header[2:] == ["sensor", "dynamics", "arm", "press"]
 
 
 @pytest.mark.parametrize(
@@ -200,13 +205,11 @@ def test_outcomes_are_one_table_with_the_clock_in_it_and_rank():
     ]
     (front,) = Report(records, detail="brief").sections[0].tables
     assert front.header == ["detector", "AUC of outcomes", "found outcome", "false episodes"]
-    first = table_titled(records, "Episodes known by their outcome alone", "wide")
-    assert first.header[1:4] == ["AUC of outcomes", "found outcome", "found outcome null"]
-    assert [row[:3] for row in first.rows] == [["mewma", "90.0", "50.0"], ["clock", "50.0", "0.0"]]
-    assert "false episodes (≤ 5 %)" in first.header
+    table = table_titled(records, ALL, "full")
+    assert table.header[3:6] == ["AUC of outcomes", "false episodes (≤ 5 %)", "found outcome"]
+    assert column(table, "AUC of outcomes") == {"mewma": "90.0", "clock": "50.0"}
     assert Board(records).ranking == "auc_outcome"
-    (alone,) = Tables(Board(records[1:])).of_logs()
-    assert ("clock" in alone.note, "clock" in first.note) == (True, False)
+    assert "The row clock shows" in table.note
     # Guaranteed alarms without delays speak of none.
     titles = [table.title for table in Tables(Board(records)).all_alarms()]
     assert titles
@@ -239,11 +242,11 @@ def banded():
 
 
 def test_the_table_of_outcomes_has_every_figure_that_records_have():
-    table = table_titled(banded(), "Episodes known by their outcome alone", "wide")
-    assert table.header[1:9] == [
+    table = table_titled(banded(), ALL, "full")
+    assert {
         "AUC of outcomes", "AUC at half time", "AUC of whole episodes", "found outcome",
         "found outcome null", "balanced accuracy", "outcome delay (steps)", "brier score",
-    ]  # fmt: skip
+    } <= {*table.header}  # fmt: skip
     assert column(table, "brier score") == {
         "chunk": UNDEFINED, "clock": UNDEFINED, "range": UNDEFINED,
         "logistic §": "0.200", "tdqc §": "0.250",
@@ -254,7 +257,7 @@ def test_the_table_of_outcomes_has_every_figure_that_records_have():
     front = table_titled(banded(), "AUC of outcomes and guaranteed alarms", "brief")
     assert front.header[1:] == ["AUC of outcomes", "found outcome", "balanced accuracy",
                                 "false episodes"]  # fmt: skip
-    wide = Report(banded(), detail="wide").sections[0].tables
+    wide = Report(banded(), detail="full").sections[0].tables
     (separability,) = [t for t in wide if t.title.startswith("All metrics")]
     assert "Brier score" not in separability.header
     (alarms,) = [t for t in wide if t.title.startswith("Guaranteed alarms at 5 %")]
@@ -265,16 +268,13 @@ def test_rows_that_learn_from_failures_stand_below_the_others_with_a_mark():
     records = banded()
     order = ["chunk", "clock", "range", "logistic §", "tdqc §"]
     for shuffled in (records, records[::-1]):
-        (section,) = Report(shuffled, detail="wide").sections
+        (section,) = Report(shuffled, detail="full").sections
         for table in section.tables:
-            assert [row[0] for row in table.rows] in (order, order[-2:]), table.title
-            assert "§ trained on failures" in table.note or "by detector seed" in table.title
-    assert "Not ranked, for what they know: logistic (trained on failures)" in (
-        table_titled(records, "AUC of outcomes and", "wide").note
-    )
-    assert "§: learns" in Report(records, detail="brief").sections[0].notes[0]
+            names = [row[0] for row in table.rows]
+            assert names in (order, order[-2:]) or " by anomaly" in table.title, table.title
+    assert "§: learns" in table_titled(records, "AUC of outcomes and", "brief").note
     # The first row is compared with the others, though a supervised one has the largest figure.
-    verdict = Report(records, detail="wide").sections[0].verdict
+    verdict = Report(records, detail="full").sections[0].verdict
     assert verdict.startswith("clock is second of three ranked rows")
     assert "chunk" in verdict
     # Where one row is left, no other band is put beside it.
@@ -322,10 +322,10 @@ def test_formats_mark_rows_that_learn_from_failures():
     for name in ("markdown", "html", "latex"):
         text = FORMATS[name].render(report)
         assert "logistic §" in text
-        assert "§ trained on failures" in text
+        assert "§: learns from failures" in text
     # Without such rows formats are what they were.
     assert "training" not in flat(banded()[:3])[0]
-    assert "§" not in str(Report(banded()[:3], detail="wide"))
+    assert "§" not in str(Report(banded()[:3], detail="full"))
 
 
 def test_the_clock_is_named_where_it_tells_failures_as_well():
@@ -350,8 +350,9 @@ def test_nominal_episodes_alone_have_false_alarms_and_no_rank():
     records = [log_record(d, anomaly="nominal", episodes=0, values=values) for d in ("mewma", "rf")]
     (section,) = Report(records, detail="brief").sections
     assert [table.header for table in section.tables] == [["detector", "false episodes"]]
-    assert not any("chance" in note or "missed" in note for note in section.notes)
-    table = table_titled(records, "Alarms on nominal", "wide")
+    note = section.tables[0].note
+    assert not any(word in note for word in ("chance", "missed"))
+    table = table_titled(records, ALL, "full")
     assert table.header == ["detector", "false episodes (≤ 5 %)", "false alarms per hour"]
     assert re.fullmatch(r"16\.7 \[.*\]", table.rows[0][1])
     for name, layout in FORMATS.items():
@@ -366,17 +367,17 @@ def test_a_board_may_have_cells_of_every_kind():
         ("idle", "nominal", values),
     ]
     records = [log_record(d, e, a, values=v) for d in ("mewma", "clock") for e, a, v in kinds]
-    tables = {d: Report(records, detail=d).sections[0].tables for d in ("brief", "wide")}
-    titles = [table.title for table in tables["brief"]]
-    assert titles == ["Pooled AUC and guaranteed alarms at 5 % (%)"]
-    titles = [table.title for table in tables["wide"]][1:5]
-    starts = ("Separability", "Episodes known", "Alarms on nominal", "Pooled AUC (%) by")
-    assert all(map(str.startswith, titles, starts))
-    assert titles[2].endswith(": idle")
-    apart = tables["wide"][4]
+    titles = {d: [t.title for t in Report(records, detail=d).sections[0].tables] for d in DETAILS}
+    assert titles["brief"] == ["Pooled AUC and guaranteed alarms at 5 % (%)"]
+    places = ["", ": arm", ": pick", ": idle"]
+    assert [t for t in titles["full"] if t.startswith(ALL)] == [f"{ALL}{at}" for at in places]
+    idle = table_titled(records, f"{ALL}: idle", "full")
+    assert idle.header == ["detector", "false episodes (≤ 5 %)", "false alarms per hour"]
+    apart = table_titled(records, BY, "full")
     assert apart.header == ["detector", "mean", "arm", "pick"]
-    # The mean is over all environments that have the metric: it has no mark.
-    assert apart.rows[0][1] == "70.0"
+
+
+DETAILS = ("brief", "full")
 
 
 def test_metrics_of_rows_stand_in_a_table_of_their_own():
@@ -385,7 +386,7 @@ def test_metrics_of_rows_stand_in_a_table_of_their_own():
     table = table_titled(records, "Metrics of rows")
     assert len(table.header) == 1 + len(extra)
     assert table.header[-1] == "VUS-PR"
-    whole = table_titled(records, "All metrics", detail="wide")
+    whole = table_titled(records, "All metrics", detail="full")
     assert not [name for name in whole.header if "rows" in name and name != "AUC of rows"]
     titles = [t.title for t in Report(two_environments()).sections[0].tables]
     assert not [title for title in titles if "Metrics of rows" in title]
@@ -452,13 +453,13 @@ def test_tables_fit_every_terminal_with_whole_names(width):
         if r.detector == "mewma"
     ]
     screen = Console(file=io.StringIO(), width=width, soft_wrap=True, highlight=False, markup=False)
-    print_sections(Report(records, detail="wide").sections, screen)
+    print_sections(Report(records, detail="full").sections, screen)
     text = screen.file.getvalue()
     assert max(map(len, text.splitlines())) <= width
     assert text.count("NameOf") >= 1
     labels = {str(r.setting) for r in records}
-    for table in Report(records, detail="wide").sections[0].tables:
-        assert {row[0] for row in table.rows} == labels
+    for table in Report(records, detail="full").sections[0].tables:
+        assert {row[0] for row in table.rows} == labels or " by anomaly" in table.title
     if width >= 80:
         assert "mewma[h=10]" in text
 
@@ -469,7 +470,7 @@ def test_show_prints_stored_records_and_one_detector(tmp_path, capsys):
     show = ["show", str(tmp_path), "--stored"]
     for options, title in (
         ([], "Pooled AUC and guaranteed alarms at 5 %"),
-        (["--wide"], "Separability (%, higher is better) and guaranteed alarms at 5 %"),
+        (["--wide"], ALL),
         (["--detector", "rf"], "rf: pooled AUC (%) by anomaly"),
         (["--detector", "rf", "--metric", "auc_rows"], "rf: AUC of rows (%) by anomaly"),
     ):
