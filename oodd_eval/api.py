@@ -28,6 +28,7 @@ from oodd_eval.plugins.contract import (
     factory_of,
 )
 from oodd_eval.plugins.discovery import Offer, Plugins, discover
+from oodd_eval.plugins.foreign import refuse_foreign
 from oodd_eval.plugins.parameters import declared_by
 from oodd_eval.plugins.specs import check_detector_spec
 from oodd_eval.results.collection import Results
@@ -99,16 +100,16 @@ def evaluate(
     Returns
     -------
     Results
-        In the order environments x detectors x seeds x anomalies. An installed detector that fails
-        gives records with another status than ``"ok"``; exceptions of detectors in this process
-        pass through.
+        In the order environments x detectors x seeds x anomalies. A detector that fails gives
+        records with another status than ``"ok"``, and loses no other row; the exception of a sole
+        detector in this process is raised.
 
     Raises
     ------
     UsageError
         For unknown names, what is no detector, and arguments of another type or out of bounds.
     ContractError
-        When a detector in this process breaks the score contract.
+        When a sole detector in this process breaks the score contract.
 
     Warns
     -----
@@ -216,6 +217,7 @@ def _spec_of(
     detector: Detector | Callable[..., Detector], arguments: Mapping[str, Any]
 ) -> DetectorSpec:
     """Return the spec of a class, a function or an unfitted detector."""
+    refuse_foreign(detector)
     factory = factory_of(detector)
     name = getattr(detector, "__name__", type(detector).__name__)
     if factory is not detector and arguments:

@@ -205,6 +205,14 @@ class OtherDefault(Good): ...
 class NoSuchParameter(Good): ...
 
 
+@breaks("inputs", "it reads actions, which its spec does not declare, so that a run hands it")
+class AddsActions(Good):
+    def score(self, x):
+        scores = super().score(x)
+        scores[1:] += np.round(np.abs(x.actions).sum(axis=1))
+        return scores
+
+
 @breaks("not-fitted", "score before fit raised AttributeError: 'NoneType' object")
 class Unprepared(Good):
     def score(self, x):

@@ -88,13 +88,27 @@ class UnitJob:
         `progress` hears which share of the fit is done, in the thread that calls.
         """
         if self.unit.local:
-            return GroupedScoring(self, progress).in_process()
+            return self._in_process(progress)
         try:
             return self._isolated(limits, stop, results, progress, fresh=fresh)
         except (SplitError, OutputError, ResultsError, UsageError):
             raise
         except Exception as error:  # noqa: BLE001  a plug-in that nobody thought of is one unit's
             return Scored("error", f"oodd-eval: {describe(error)}", log=traceback.format_exc())
+
+    def _in_process(self, progress: Progress) -> Scored:
+        """Return the scores of a detector of this process; the sole one's errors are raised."""
+        try:
+            return GroupedScoring(self, progress).in_process()
+        except (SplitError, OutputError, ResultsError):
+            raise
+        except Exception as error:
+            if len({unit.setting.detector for unit in self.plan.units}) == 1:
+                raise
+            log = traceback.format_exc()
+            if isinstance(error, ContractError):
+                return Scored("invalid", str(error), log=log)
+            return Scored("error", describe(error), log=log)
 
     def _isolated(
         self,
@@ -221,7 +235,7 @@ class GroupedScoring:
         return Scored(file=replace(scores, cost=cost, voices=outcome.voices))
 
     def in_process(self) -> Scored:
-        """Fit and score in this process, a copy each group; errors of the detector pass through.
+        """Fit and score in this process, a copy each group; errors of the detector are raised.
 
         One that cannot be copied is fitted again for each group.
         """

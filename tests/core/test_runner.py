@@ -140,13 +140,40 @@ def test_in_process_and_worker_agree(tiny_split):
     assert [r.metrics for r in one] == [r.metrics for r in two]
 
 
-def test_evaluate_passes_on_what_a_factory_raises(tiny_split):
-    class Short(Clock):
-        def score(self, trajectory):
-            return super().score(trajectory)[1:]
+class Short(Clock):
+    """Returns a score too few."""
 
+    def score(self, trajectory):
+        return super().score(trajectory)[1:]
+
+
+class Unlucky(Clock):
+    """Cannot be fitted on CartPole."""
+
+    def fit(self, nominal):
+        if nominal[0].observation_dim == 4:
+            raise ValueError("no luck")
+
+
+def test_evaluate_passes_on_what_a_sole_detector_raises(tiny_split):
     with pytest.raises(ContractError, match=r"'short' returned 60 scores for cartpole/calibration"):
         evaluate(Short, tiny_split)
+
+
+def test_a_detector_that_raises_loses_no_row_of_several(tiny_split):
+    tried = [Unlucky, local_spec("range"), Short]
+    cells = {"environments": "cartpole,hopper", "anomalies": "iid"}
+    rows = {(r.detector, r.environment): r for r in evaluate(tried, tiny_split, **cells)}
+    statuses = {key: record.status for key, record in rows.items()}
+    assert statuses == {
+        ("unlucky", "cartpole"): "error", ("unlucky", "hopper"): "ok",
+        ("range", "cartpole"): "ok", ("range", "hopper"): "ok",
+        ("short", "cartpole"): "invalid", ("short", "hopper"): "invalid",
+    }  # fmt: skip
+    assert rows["unlucky", "cartpole"].reason == "ValueError: no luck"
+    assert "'short' returned 60 scores" in rows["short", "cartpole"].reason
+    alone = evaluate([local_spec("range")], tiny_split, **cells)
+    assert [r.metrics for r in alone] == [rows["range", r.environment].metrics for r in alone]
 
 
 COUNTING = """

@@ -1,5 +1,6 @@
 """Classes of other libraries as detectors: direction, causality, horizons, names, errors."""
 
+import importlib
 import sys
 import threading
 
@@ -8,11 +9,15 @@ import pytest
 import torch
 from oodd_adapters import windows as w
 from river import anomaly as river_anomaly
+from river import drift as river_drift
 from river import preprocessing
+from sklearn.decomposition import PCA
 from sklearn.ensemble import IsolationForest
+from sklearn.linear_model import Ridge
+from sklearn.mixture import GaussianMixture
 from sklearn.neighbors import KernelDensity
 
-from oodd_eval import Trajectory
+from oodd_eval import Trajectory, check_detector, evaluate
 from oodd_eval.cli.main import main
 from oodd_eval.errors import ContractError, FittedStateError, UnknownNameError, UsageError
 from oodd_eval.plugins.discovery import discover
@@ -510,3 +515,50 @@ def test_a_state_is_the_rows_and_gives_the_same_scores(theirs, name):
         make(name, window=3).restore(packed.state())
     with pytest.raises(FittedStateError, match="'later'"):
         make(name, window=2).restore({**packed.state(), "later": np.zeros((149, 3), np.float32)})
+
+
+# Objects of other libraries, handed over as they are
+
+
+@pytest.mark.parametrize(
+    ("made", "name"),
+    [
+        (IsolationForest, "sklearn:IsolationForest"),
+        (lambda: IsolationForest, "sklearn:IsolationForest"),
+        (GaussianMixture, "sklearn:GaussianMixture"),  # it has fit and score, of other things
+        (Ridge, "forecast:sklearn.linear_model.Ridge"),
+        (lambda: pytest.importorskip("pyod.models.knn").KNN(), "pyod:KNN"),
+        (river_anomaly.HalfSpaceTrees, "river:HalfSpaceTrees"),
+    ],
+)
+def test_an_object_of_another_library_is_told_its_name(made, name):
+    with pytest.raises(UsageError, match=f"hand over the name '{name}'") as refused:
+        evaluate([made()])
+    with pytest.raises(UsageError, match=f"hand over the name '{name}'"):
+        check_detector(made())
+    assert "fit(nominal) and score(trajectory)" in str(refused.value)
+    assert discover().offer(name).spec.name == name
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        PCA,  # neither an outlier detector nor a forecaster
+        lambda: torch.nn.Linear(1, 1),
+        lambda: pytest.importorskip("pyod.models.anogan").AnoGAN,  # refused by name
+        river_drift.ADWIN,
+    ],
+)
+def test_an_object_without_a_name_is_told_which_methods_it_lacks(made):
+    with pytest.raises(UsageError, match="hand over a class with these two methods around it"):
+        evaluate([made()])
+
+
+def test_a_forecaster_of_ones_own_is_told_its_name(monkeypatch, tmp_path):
+    (tmp_path / "my_forecasts.py").write_text(
+        "class Mine:\n    def fit(self, x, y): ...\n    def predict(self, x): ...\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    mine = importlib.import_module("my_forecasts").Mine
+    with pytest.raises(UsageError, match="hand over the name 'forecast:my_forecasts.Mine'"):
+        evaluate(mine)

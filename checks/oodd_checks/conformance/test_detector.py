@@ -9,6 +9,7 @@ import contextlib
 import re
 import tempfile
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -103,6 +104,26 @@ def test_declared_parameters(trial: Trial) -> None:
     problem = f"scores change when the declared defaults ({values}) are spelt out"
     advice = "expected the defaults of the spec to be those of the factory"
     trial.must_agree(detector, problem, advice, n=1)
+
+
+def test_inputs(trial: Trial) -> None:
+    """Actions change no score where the spec declares that scores depend on observations alone."""
+    spec = trial.spec
+    if trial.actions or spec.with_actions:
+        pytest.skip("declares actions, or a detector that takes its place where there are any")
+    trial.fitted()
+    settings = {"horizon": trial.horizon, "seed": trial.seed, "parameters": trial.parameters}
+    shown = Trial(replace(spec, inputs="observations+actions"), **settings)
+    if isinstance(shown.first_fit, AssertionError):
+        return  # It takes no episodes with actions, so that it does not read them in silence.
+    for bare, full in zip(trial.nominal(2), shown.nominal(2), strict=True):
+        assert_equal(
+            shown.scores(full),
+            trial.scores(bare),
+            "it reads actions, which its spec does not declare, so that a run hands it actions of "
+            "width 0; shown actions, its scores differ",
+            'say inputs="observations+actions" in its DetectorSpec, or leave actions alone',
+        )
 
 
 def test_not_fitted(trial: Trial) -> None:
