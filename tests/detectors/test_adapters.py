@@ -560,5 +560,5 @@ def test_a_forecaster_of_ones_own_is_told_its_name(monkeypatch, tmp_path):
     )
     monkeypatch.syspath_prepend(tmp_path)
     mine = importlib.import_module("my_forecasts").Mine
-    with pytest.raises(UsageError, match="hand over the name 'forecast:my_forecasts.Mine'"):
+    with pytest.raises(UsageError, match=r"the name 'forecast:my_forecasts\.Mine'"):
         evaluate(mine)
