@@ -9,6 +9,7 @@ The exit code is 1 where fewer than nine in ten are inside. `--rung paper-whole`
 """
 
 import argparse
+import functools
 import sys
 from concurrent.futures import ProcessPoolExecutor
 
@@ -23,11 +24,17 @@ from oodd_eval.names import select
 FIRST_SEED = 970_000_000  # the calibration's begin at 950 000 000
 
 
+@functools.cache
+def nominal_of(environment, count, *, whole):
+    return twins_of(environment, FIRST_SEED, count, whole=whole)
+
+
 def fresh(task):
     environment, kind, name, strength, count = task
-    given = {"first": FIRST_SEED, "count": count, "whole": name == WHOLE}
-    nominal = np.array([return_of(twin) for twin in twins_of(environment, **given)])
-    returns = np.array(measure(environment, kind, strength, **given))
+    whole = name == WHOLE
+    twins = nominal_of(environment, count, whole=whole)
+    nominal = np.array([return_of(twin) for twin in twins])
+    returns = np.array(measure(environment, kind, strength, twins, whole=whole))
     # The standard error of a fresh mean: the noise of the check itself is not the ladder's.
     error = (returns - nominal).std(ddof=1) / np.sqrt(count) / abs(nominal.mean())
     return environment, kind, name, float(kept_shares(returns, nominal)), float(error)

@@ -43,7 +43,7 @@ class _Running:
 
 @dataclass(slots=True)
 class Pace:
-    """Number of finished cells of a run, and the time for the others at the same speed.
+    """Number of finished cells, or other parts, and the time for the others at the same speed.
 
     Cells of an earlier run take no time, so that they say nothing of the speed. A unit's cells come
     all at once: between two units the speed stays that of the last.
@@ -52,11 +52,14 @@ class Pace:
     ----------
     total, start
         Number of cells, and when the run began, in seconds.
+    done, noun
+        Number of those that are finished, and their name.
     """
 
     total: int
     start: float
     done: int = 0
+    noun: str = "cells"
     _fresh: int = 0
     _latest: float = 0.0
 
@@ -82,7 +85,14 @@ class Pace:
         now = time.perf_counter()
         spent, left = now - self.start, self.left(now)
         ahead = "" if math.isnan(left) else f", {timedelta(seconds=math.ceil(left))} left"
-        return f"{self.done}/{self.total} cells, {timedelta(seconds=int(spent))} so far{ahead}"
+        done = f"{self.done}/{self.total} {self.noun}"
+        return f"{done}, {timedelta(seconds=int(spent))} so far{ahead}"
+
+    def __rich__(self) -> Table:
+        """Return a bar with the line beside it."""
+        bar = Table.grid(padding=(0, 1))
+        bar.add_row(ProgressBar(max(self.total, 1), self.done, 20), Text(str(self), no_wrap=True))
+        return bar
 
 
 class Display:
@@ -157,11 +167,8 @@ class Display:
 
     def _state(self) -> RenderableType:
         """Return the bar, with what runs below it."""
-        bar = Table.grid(padding=(0, 1))
-        pace = self._pace
-        bar.add_row(ProgressBar(max(pace.total, 1), pace.done, 20), Text(str(pace), no_wrap=True))
         running = (Text(line, no_wrap=True, overflow="ellipsis") for line in self._at_work())
-        return Group(bar, *running)
+        return Group(self._pace, *running)
 
     def _at_work(self) -> list[str]:
         """Return a line on each unit that runs, of many on the first ones."""

@@ -10,13 +10,13 @@ them. Intervals are percentiles of a bootstrap over the seeds.
 A measured strength is one line of JSON in a work file: an interrupted calibration goes on.
 """
 
-import functools
+import itertools
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import Future, as_completed
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +27,8 @@ from oodd_eval.data.files import write_text
 from oodd_eval.data.registry import environment_spec
 from oodd_eval.errors import SimulationError
 from oodd_eval.metrics.threshold import isotonic
-from oodd_recording.build import workers
+from oodd_eval.scoring.cores import available_cores
+from oodd_recording.build import Progress, workers
 from oodd_recording.closed_loop import (
     GENERATOR_VERSION,
     RecordedEpisode,
@@ -52,6 +53,10 @@ FIRST_JUDGED: Final = 60  # row from which on losses count: episodes begin with 
 Floats = NDArray[np.float64]
 Curve = dict[float, list[float]]
 """Returns of the seeds, in their order, by strength."""
+Pair = tuple[str, str]
+"""An environment and a kind of anomaly."""
+_Line = tuple[str, str, str, float]
+"""What returns are of: key, environment, kind, strength."""
 
 
 def setup_of(environment: str, *, whole: bool = False) -> Setup:
@@ -85,7 +90,6 @@ def loss_of(episode: RecordedEpisode, cap: int) -> float:
     return float(losses.sum()) + max(0, cap - max(len(episode.rewards), start))
 
 
-@functools.cache
 def twins_of(
     environment: str, first: int = FIRST_SEED, count: int = 0, *, whole: bool = False
 ) -> list[RecordedEpisode]:
@@ -98,17 +102,13 @@ def measure(
     environment: str,
     kind: str,
     strength: float,
-    first: int = FIRST_SEED,
-    count: int = 0,
+    twins: Sequence[RecordedEpisode],
     *,
     whole: bool = False,
 ) -> list[float]:
-    """Return the returns of the seeds under an anomaly of a strength, or their negative losses."""
+    """Return the returns of twins' seeds under an anomaly of a strength, or negative losses."""
     setup = setup_of(environment, whole=whole)
-    episodes = (
-        record_anomalous(setup, kind, strength, twin, redraws=0)
-        for twin in twins_of(environment, first, count, whole=whole)
-    )
+    episodes = (record_anomalous(setup, kind, strength, twin, redraws=0) for twin in twins)
     if has_loss(environment):
         return [-loss_of(episode, info_of(environment).episode_cap) for episode in episodes]
     return [return_of(episode) for episode in episodes]
@@ -200,6 +200,23 @@ def next_strength(
     return 0.0
 
 
+def _expected(
+    environment: str, kind: str, curve: Curve, nominal: Sequence[float], *, whole: bool
+) -> int:
+    """Return how many strengths are still to be measured, if returns lie on lines between these."""
+    curve, base, before = dict(curve), np.array(nominal), len(curve)
+    while strength := next_strength(environment, kind, curve, nominal, whole=whole):
+        points = {0.0: base} | {s: np.array(returns) for s, returns in curve.items()}
+        if not curve:  # the bound comes first, and may cost half
+            points[2 * strength] = base - abs(base.mean())
+        strengths = sorted(points)
+        i = int(np.searchsorted(strengths, strength))
+        share = (strength - strengths[i - 1]) / (strengths[i] - strengths[i - 1])
+        low, high = points[strengths[i - 1]], points[strengths[i]]
+        curve[strength] = list(low + share * (high - low))
+    return len(curve) - before
+
+
 def _arrays(curve: Curve, nominal: Sequence[float]) -> tuple[Floats, Floats, Floats]:
     """Return strengths, rising, their returns of shape (strengths, seeds), and nominal returns."""
     strengths = sorted(curve)
@@ -258,6 +275,102 @@ def _rounded(value: float) -> float:
     return float(f"{value:.4g}")
 
 
+class _Measurement:
+    """Returns of pairs of environment and kind, each measured one a line of a work file."""
+
+    def __init__(
+        self, pairs: Sequence[Pair], measured: dict[_Line, list[float]], *, whole: bool
+    ) -> None:
+        self._pairs, self._measured, self._whole = pairs, measured, whole
+        caps = [WHOLE] if whole else []
+        self._keys = {
+            e: [GENERATOR_VERSION, setup_of(e).policy.digest, episodes_of(e), *caps]
+            for e, _ in pairs
+        }
+
+    def run(self, pool: Executor, jobs: int, lines: TextIO, progress: Progress) -> None:
+        """Measure what is missing; seeds are shared out, so that all jobs work to the end."""
+        whole, counts = self._whole, {pair: self._count(*pair) for pair in self._pairs}
+        unfinished = [pair for pair in self._pairs if self._following(*pair) is not None]
+        recording: dict[str, list[Future[list[RecordedEpisode]]]] = {}
+        for e in dict.fromkeys(e for e, _ in unfinished):
+            ends = np.linspace(0, episodes_of(e), jobs + 1, dtype=int).tolist()
+            recording[e] = [
+                pool.submit(twins_of, e, FIRST_SEED + i, j - i, whole=whole)
+                for i, j in itertools.pairwise(ends)
+                if i < j
+            ]
+        parts: dict[str, list[list[RecordedEpisode]]] = {}
+        pending: dict[Future[list[float]], tuple[str, str, float, list[Future[list[float]]]]] = {}
+
+        def tell(what: str) -> None:
+            done = len(parts) + sum(measured for measured, _ in counts.values())
+            total = len(recording) + sum(most for _, most in counts.values())
+            progress(done, total, what)
+
+        def go_on(e: str, kind: str) -> None:
+            if (strength := self._following(e, kind)) is not None:
+                given = e, kind, strength
+                futures = [pool.submit(measure, *given, part, whole=whole) for part in parts[e]]
+                pending.update(dict.fromkeys(futures, (*given, futures)))
+            counts[e, kind] = self._count(e, kind)
+
+        tell("")
+        for e, recorded in recording.items():
+            parts[e] = [future.result() for future in recorded]
+            if not has_loss(e) and not self.nominal(e, ""):
+                self._keep(lines, e, "", 0.0, [return_of(t) for part in parts[e] for t in part])
+            for pair in unfinished:
+                if pair[0] == e:
+                    go_on(*pair)
+            tell(e)
+        while pending:
+            for future in wait(pending, return_when=FIRST_COMPLETED).done:
+                e, kind, strength, together = pending.pop(future)
+                if not any(other in pending for other in together):
+                    returns = [r for other in together for r in other.result()]
+                    self._keep(lines, e, kind, strength, returns)
+                    go_on(e, kind)
+                    tell(f"{e} {kind}")
+
+    def _keep(
+        self, lines: TextIO, environment: str, kind: str, strength: float, returns: list[float]
+    ) -> None:
+        pair = {"key": self._keys[environment], "environment": environment, "kind": kind}
+        line = pair | {"strength": strength}
+        lines.write(json.dumps(line | {"returns": returns}) + "\n")
+        lines.flush()
+        self._measured[_identity(line)] = returns
+
+    def _curve(self, environment: str, kind: str) -> Curve:
+        pair = str(self._keys[environment]), environment, kind
+        return {line[3]: r for line, r in self._measured.items() if line[:3] == pair}
+
+    def anomalous(self, environment: str, kind: str) -> Curve:
+        """Return the returns by strength."""
+        return {s: returns for s, returns in self._curve(environment, kind).items() if s}
+
+    def nominal(self, environment: str, kind: str) -> list[float]:
+        """Return the nominal returns; of losses, which count from the onset, those of a kind."""
+        curve = self._curve(environment, kind if has_loss(environment) else "")
+        return curve.get(0.0, [])
+
+    def _following(self, environment: str, kind: str) -> float | None:
+        """Return the strength to measure next, the nominal one first; None after the last."""
+        if not (nominal := self.nominal(environment, kind)):
+            return 0.0 if has_loss(environment) else bound_of(environment, kind)
+        curve = self.anomalous(environment, kind)
+        return next_strength(environment, kind, curve, nominal, whole=self._whole) or None
+
+    def _count(self, environment: str, kind: str) -> tuple[int, int]:
+        """Return how many strengths are measured, and how many there may be in the end."""
+        done, nominal = self._curve(environment, kind), self.nominal(environment, kind)
+        curve = self.anomalous(environment, kind) if nominal else {}
+        guess = nominal or [1.0, 1.0]
+        left = _expected(environment, kind, curve, guess, whole=self._whole)
+        return len(done), len(done) + left + (has_loss(environment) and not nominal)
+
+
 def calibrate(
     output: Path,
     work: Path,
@@ -266,12 +379,13 @@ def calibrate(
     kinds: Sequence[str],
     whole: bool = False,
     jobs: int | None = None,
-    progress: Callable[[str], None] = lambda _text: None,
+    progress: Progress = lambda _done, _total, _what: None,
 ) -> dict[str, dict[str, Any]]:
     """Measure and find the rungs of some environments and kinds; return all that `output` has.
 
     `whole` finds the rung of robots for whole episodes, and of the paper's kinds alone. Returns
     that `work` holds are not measured again. Other entries and rungs in `output` are kept.
+    `progress` hears how many strengths are measured, and of how many: an estimate until the end.
     """
     pairs = [
         (e, kind)
@@ -280,70 +394,30 @@ def calibrate(
         if kind in kinds_of(e)
         and (not whole or (kind in TABLE1 and e in ENVIRONMENTS and not ENVIRONMENTS[e].discrete))
     ]
-    measured, broken = _read_work(work)
-    caps = [WHOLE] if whole else []
-    key = {
-        e: [GENERATOR_VERSION, setup_of(e).policy.digest, episodes_of(e), *caps] for e, _ in pairs
-    }
+    returns, broken = _read_work(work)
+    measurement = _Measurement(pairs, returns, whole=whole)
     work.parent.mkdir(parents=True, exist_ok=True)
     with workers(jobs) as pool, work.open("a", encoding="utf-8") as lines:
         lines.write("\n" * broken)
-
-        def keep(e: str, kind: str, strength: float, returns: list[float]) -> None:
-            line = {"key": key[e], "environment": e, "kind": kind, "strength": strength}
-            lines.write(json.dumps(line | {"returns": returns}) + "\n")
-            lines.flush()
-            measured[_identity(line)] = returns
-
-        def curve(e: str, kind: str) -> Curve:
-            return {i[3]: r for i, r in measured.items() if i[:3] == (str(key[e]), e, kind)}
-
-        def strong(e: str, kind: str) -> Curve:
-            return {strength: r for strength, r in curve(e, kind).items() if strength}
-
-        def base(e: str, kind: str) -> list[float]:
-            # Losses count from the onset, which differs by kind.
-            return curve(e, kind if has_loss(e) else "")[0.0]
-
-        pending: dict[Future[list[float]], tuple[str, str, float]] = {}
-
-        def go_on(e: str, kind: str) -> None:
-            nominal = base(e, kind)
-            if strength := next_strength(e, kind, strong(e, kind), nominal, whole=whole):
-                future = pool.submit(measure, e, kind, strength, whole=whole)
-                pending[future] = e, kind, strength
-
-        for e, kind in pairs:
-            if has_loss(e) and not curve(e, kind):
-                keep(e, kind, 0.0, measure(e, kind, 0.0))
-            elif not has_loss(e) and not curve(e, ""):
-                keep(e, "", 0.0, [return_of(twin) for twin in twins_of(e, whole=whole)])
-        for pair in pairs:
-            go_on(*pair)
-        count = 0
-        while pending:
-            done = next(as_completed(pending))
-            e, kind, strength = pending.pop(done)
-            keep(e, kind, strength, done.result())
-            count += 1
-            progress(f"{count}  {e} {kind}")
-            go_on(e, kind)
-        ladder = json.loads(output.read_text(encoding="utf-8")) if output.exists() else {}
-        for e, kind in pairs:
-            rungs = find_rungs(e, kind, strong(e, kind), base(e, kind), whole=whole)
-            ladder[e] = ladder.get(e, {}) | {kind: ladder.get(e, {}).get(kind, {}) | rungs}
+        measurement.run(pool, jobs or available_cores(), lines, progress)
+    ladder = json.loads(output.read_text(encoding="utf-8")) if output.exists() else {}
+    for e, kind in pairs:
+        curve, nominal = measurement.anomalous(e, kind), measurement.nominal(e, kind)
+        rungs = find_rungs(e, kind, curve, nominal, whole=whole)
+        ladder[e] = ladder.get(e, {}) | {kind: ladder.get(e, {}).get(kind, {}) | rungs}
     ordered = {e: ladder[e] for e in in_order(ladder, ENVIRONMENTS)}
     write_text(output, json.dumps(ordered, indent=1) + "\n")
     return ordered
 
 
-def _identity(line: Mapping[str, Any]) -> tuple[str, str, str, float]:
+def _identity(line: Mapping[str, Any]) -> _Line:
     return str(line["key"]), line["environment"], line["kind"], line["strength"]
 
 
-def _read_work(work: Path) -> tuple[dict[tuple[str, str, str, float], list[float]], bool]:
+def _read_work(work: Path) -> tuple[dict[_Line, list[float]], bool]:
     """Return measured returns, and whether the last line is the begin of an interrupted write."""
-    measured, content = {}, work.read_text(encoding="utf-8") if work.exists() else ""
+    measured: dict[_Line, list[float]] = {}
+    content = work.read_text(encoding="utf-8") if work.exists() else ""
     for text in content.splitlines():
         try:
             line = json.loads(text)

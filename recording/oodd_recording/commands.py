@@ -4,7 +4,8 @@ The evaluator knows them by name only (`oodd_eval.cli.main`).
 """
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from itertools import chain
 from pathlib import Path
 from typing import Final
@@ -12,6 +13,7 @@ from typing import Final
 import click
 from oodd_checks.commands.check import STYLES
 from oodd_checks.conformance import CheckReport, Result
+from rich.live import Live
 
 from oodd_eval.cli import (
     COUNT,
@@ -36,7 +38,8 @@ from oodd_eval.data.registry import AnomalySpec, EnvironmentSpec, inner_of
 from oodd_eval.data.split import data_home, load_split
 from oodd_eval.errors import UsageError
 from oodd_eval.names import Predicate, assignment, counted, select
-from oodd_recording.build import build_split
+from oodd_eval.scoring.display import SILENCE, Pace
+from oodd_recording.build import Progress, build_split
 from oodd_recording.calibrate import calibrate as find_strengths
 from oodd_recording.checks import custom_checks
 from oodd_recording.closed_loop import evaluate_policy
@@ -205,6 +208,26 @@ def _definition(options: Options) -> SplitDefinition:
     )
 
 
+@contextmanager
+def _shown(noun: str, *, quiet: bool) -> Iterator[Progress]:
+    """Show how much is done and what is left: a bar on a terminal, else a line now and then."""
+    console, said = make_console(quiet=quiet), -SILENCE
+    pace = Pace(0, time.perf_counter(), noun=noun)
+
+    def show(done: int, total: int, what: str) -> None:
+        nonlocal said
+        pace.total, now = total, time.perf_counter()
+        while pace.done < done:
+            pace.add(now, resumed=not what)
+        if not console.is_terminal and now >= said + SILENCE:
+            said = now
+            console.print(f"{pace}  {what}".rstrip())
+
+    live = Live(pace, console=console, transient=True, refresh_per_second=2)
+    with live if console.is_terminal and not quiet else nullcontext():
+        yield show
+
+
 @command("data calibrate --env cartpole --output ladder.json", plugins=True)
 @click.option("--env", default="all", type=Names("envs"), help="environments")
 @click.option("--anomaly", default="all", type=Names("anomalies"), help="kinds of anomalies")
@@ -222,7 +245,6 @@ def calibrate(options: Options) -> int:
 
     With --env, also in environments of plug-ins, and of kinds of theirs.
     """
-    notes = make_console(quiet=options.verbosity < 0)
     specs = register_custom(options) if options.env != "all" else []
     custom = [spec.name for spec in specs if isinstance(spec, EnvironmentSpec)]
     kinds = [spec.name for spec in specs if isinstance(spec, AnomalySpec)]
@@ -230,15 +252,17 @@ def calibrate(options: Options) -> int:
     if options.env != "all":
         environments = select("environment", options.env, [*ENVIRONMENTS, *custom])
     work = options.work or options.output.with_name(options.output.name + ".work")
-    strengths = find_strengths(
-        options.output,
-        work,
-        environments=environments,
-        kinds=select("anomaly", options.anomaly, [*ANOMALIES, *kinds]),
-        whole=options.whole,
-        jobs=options.jobs,
-        progress=notes.print,
-    )
+    selected = select("anomaly", options.anomaly, [*ANOMALIES, *kinds])
+    with _shown("evaluations", quiet=options.verbosity < 0) as progress:
+        strengths = find_strengths(
+            options.output,
+            work,
+            environments=environments,
+            kinds=selected,
+            whole=options.whole,
+            jobs=options.jobs,
+            progress=progress,
+        )
     kinds_measured = counted(sum(map(len, strengths.values())), "kind(s)")
     of = counted(len(strengths), "environment(s)")
     make_console().print(f"strengths of {kinds_measured} in {of}: {options.output}")

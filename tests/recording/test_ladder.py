@@ -1,14 +1,16 @@
 """The suite ladder: strengths found by what they cost, and splits built with them."""
 
+import io
 import json
 import math
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 pytest.importorskip("gymnasium")
 
-from oodd_recording import build, calibrate
+from oodd_recording import build, calibrate, commands
 from oodd_recording.build import build_split
 from oodd_recording.values import bound_of, unit_of
 
@@ -124,12 +126,15 @@ def measured(monkeypatch, tmp_path):
     calls = []
     noise = np.random.default_rng(0).normal(size=32)
 
-    def measure(environment, kind, strength, *_, whole=False):
+    def measure(environment, kind, strength, twins, *, whole=False):
         calls.append((kind, strength))
         if kind == "bias":
-            return [100.0 if strength < STEP else 40.0] * 32
+            return [100.0 if strength < STEP else 40.0] * len(twins)
         returns = curve(strength, 0.05 if whole else 0.2) if kind != "stuck" else 100.0
-        return list(returns + noise * strength)
+        return list(returns + noise[twins] * strength)
+
+    def twins_of(environment, first, count, *, whole=False):
+        return [*range(first - calibrate.FIRST_SEED, first - calibrate.FIRST_SEED + count)]
 
     class Pool:
         def __init__(self, *_):
@@ -151,12 +156,12 @@ def measured(monkeypatch, tmp_path):
     monkeypatch.setattr(calibrate, "measure", measure)
     monkeypatch.setattr(calibrate, "workers", Pool)
     monkeypatch.setattr(calibrate, "return_of", lambda _: 100.0)
-    monkeypatch.setattr(calibrate, "twins_of", lambda *_, **__: [None] * 32)
+    monkeypatch.setattr(calibrate, "twins_of", twins_of)
 
-    def go(kinds=("iid",), environments=("hopper",), **options):
+    def go(kinds=("iid",), environments=("hopper",), jobs=1, **options):
         found = calibrate.calibrate(
             tmp_path / "ladder.json", tmp_path / "work.jsonl", environments=environments,
-            kinds=kinds, **options,
+            kinds=kinds, jobs=jobs, **options,
         )  # fmt: skip
         return found["hopper"]
 
@@ -203,6 +208,55 @@ def test_a_calibration_goes_on_where_it_was_interrupted(measured):
     calls.clear()
     assert go() == whole
     assert calls == []
+
+
+def test_seeds_that_workers_share_out_stay_in_their_order(measured):
+    go, calls, place = measured
+    strengths, work = go(["iid", "bias"]), (place / "work.jsonl").read_text()
+    for name in ("ladder.json", "work.jsonl"):
+        (place / name).unlink()
+    calls.clear()
+    assert go(["iid", "bias"], jobs=3) == strengths
+    lines = (place / "work.jsonl").read_text().splitlines()
+    assert sorted(lines) == sorted(work.splitlines())
+    assert len(calls) == 3 * (len(lines) - 1)
+
+
+def test_progress_has_an_end_that_comes(measured):
+    go, calls, _ = measured
+    told = []
+    kinds = ["iid", "bias", "stuck"]
+    go(kinds, progress=lambda *given: told.append(given))
+    assert told[0][::2] == (0, "")
+    assert told[-1][0] == told[-1][1] == len(calls) + 1  # and the nominal episodes
+    assert [done for done, _, _ in told] == [*range(len(calls) + 2)]
+    assert all(0.5 <= total / (len(calls) + 1) <= 2 for _, total, _ in told)
+    told.clear()
+    go(kinds, progress=lambda *given: told.append(given))
+    assert told == [(len(calls), len(calls), "")]
+    assert go([], progress=lambda *given: told.append(given))
+
+
+def test_a_calibration_shows_a_bar_or_now_and_then_a_line(monkeypatch):
+    def shown(*, terminal, quiet=False, silence=0.0):
+        file = io.StringIO()
+        console = Console(file=file, force_terminal=terminal, width=80, quiet=quiet)
+        monkeypatch.setattr(commands, "make_console", lambda **_: console)
+        monkeypatch.setattr(commands, "SILENCE", silence)
+        with commands._shown("evaluations", quiet=quiet) as show:
+            show(2, 9, "")
+            show(3, 8, "hopper iid")
+        return file.getvalue()
+
+    first, second = shown(terminal=False).splitlines()
+    assert first.startswith("2/9 evaluations, 0:00:00 so far")
+    assert "left" not in first  # of an earlier call
+    assert second.startswith("3/8 evaluations, ")
+    assert second.endswith(" left  hopper iid")
+    assert len(shown(terminal=False, silence=60.0).splitlines()) == 1
+    assert "3/8 evaluations" in shown(terminal=True)
+    assert not shown(terminal=True, quiet=True)
+    assert not shown(terminal=False, quiet=True)
 
 
 def test_on_whole_episodes_one_rung_of_the_papers_kinds_is_found_and_added(measured):
