@@ -1,13 +1,13 @@
 """Policies of ONNX files: plain layers become arrays, any other graph runs in onnxruntime."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from oodd_eval.data.bounded import POLICY, read_bytes
+from oodd_eval.data.bounded import POLICY, open_plain, read_bytes
 from oodd_eval.data.files import replacing
 from oodd_eval.errors import MissingExtraError, PolicyError
 from oodd_recording.mlp import NUMBERS
@@ -26,8 +26,11 @@ class _NotPlainError(Exception):
     """The graph is more than layers in a row."""
 
 
-def read_model(path: Path) -> Any:
-    """Return the model of an ONNX file; `PolicyError` where it is none."""
+def read_model(path: Path, *, beside: bool = False) -> Any:
+    """Return the model of an ONNX file; `PolicyError` where it is none.
+
+    With `beside` its weights may be in other files of the same directory; the model then has them.
+    """
     try:
         import onnx  # noqa: PLC0415  of an extra
     except ImportError as error:
@@ -37,30 +40,67 @@ def read_model(path: Path) -> Any:
     content = read_bytes(path, POLICY.most, PolicyError)
     try:
         model = onnx.load_model_from_string(content)
-        inside = all(not tensor.data_location for tensor in _tensors(model.graph))
-        if inside:
+        outside = [tensor for tensor in _tensors(model) if tensor.data_location]
+        room = POLICY.most - len(content)
+        for tensor in outside if beside else ():
+            room -= _take_in(tensor, path, room)
+        if beside or not outside:
             onnx.checker.check_model(model)
+            for tensor in _tensors(model):  # as many numbers as it announces
+                onnx.numpy_helper.to_array(tensor)
+    except PolicyError:
+        raise
     except Exception as error:  # protobuf's and onnx's have no common base
         text = str(error).partition("\n")[0]
         raise PolicyError(
             f"{path.name} is no ONNX model: {text:.200}; expected a whole file, as "
             "onnx.save_model writes it"
         ) from error
-    if not inside:
+    if outside and not beside:
         raise PolicyError(
-            f"{path.name} keeps weights in other files, expected one file: save it with "
-            "onnx.save_model(model, path, save_as_external_data=False)"
+            f"{path.name} keeps weights in other files, expected one file: take it over with "
+            "`oodd-eval policies import`"
         )
     return model
 
 
-def _tensors(graph: Any) -> Iterator[Any]:
-    """Yield the tensors of a graph, and of graphs in it."""
-    yield from graph.initializer
-    for attribute in (a for node in graph.node for a in node.attribute):
-        yield from (attribute.t, *attribute.tensors)
-        for inner in (attribute.g, *attribute.graphs):
-            yield from _tensors(inner)
+def _take_in(tensor: Any, path: Path, room: int) -> int:
+    """Put the content of a tensor that is in a file beside the model into it; return its bytes."""
+    facts = {entry.key: entry.value for entry in tensor.external_data}
+    name, offset = facts.get("location", ""), int(facts.get("offset", 0))
+    length = int(facts.get("length", room + 1))
+    file = path.parent / name
+    # Links count where they lead: a cache may have both files elsewhere, but together.
+    if Path(name).name != name or file.resolve().parent != path.resolve().parent:
+        raise PolicyError(
+            f"{path.name} keeps weights in {name!r:.200}, expected a file in its own directory"
+        )
+    try:
+        with open_plain(file) as opened:
+            opened.seek(offset)
+            content = opened.read(min(max(length, 0), room + 1))
+    except OSError as error:
+        raise PolicyError(
+            f"{path.name} keeps weights in {name!r}, which cannot be read ({error.strerror}): "
+            "expected that file beside it"
+        ) from error
+    if len(content) > room:
+        raise PolicyError(f"{path.name} has, with other files, more than {POLICY.most} bytes")
+    tensor.raw_data = content
+    tensor.ClearField("data_location")
+    tensor.ClearField("external_data")
+    return len(content)
+
+
+def _tensors(message: Any) -> Iterator[Any]:
+    """Yield the tensors that a model, or a part of it, has at any depth."""
+    for field, value in message.ListFields():
+        if field.message_type is not None:
+            for inner in value if isinstance(value, Sequence) else [value]:
+                if field.message_type.name == "TensorProto":
+                    yield inner
+                else:
+                    yield from _tensors(inner)
 
 
 def layers_of(path: Path, output: str = "") -> Arrays | None:
@@ -69,11 +109,12 @@ def layers_of(path: Path, output: str = "") -> Arrays | None:
     Parameters
     ----------
     path
-        An ONNX file whose first input is a row of observations, with a batch of one before it.
+        An ONNX file whose first input is a row of observations, with a batch of one before it;
+        weights may be in files beside it.
     output
         Name of the output with the action, by default the first.
     """
-    graph = read_model(path).graph
+    graph = read_model(path, beside=True).graph
     try:
         return _walk(graph, _name_of_output(graph, output, path.name))
     except _NotPlainError:
@@ -199,7 +240,7 @@ def write_policy(path: Path, tensor: str, arrays: Arrays | None, output: Path) -
         if arrays is not None:
             np.savez_compressed(file, allow_pickle=False, **arrays)
             return
-        model = read_model(path)
+        model = read_model(path, beside=True)
         name = _name_of_output(model.graph, tensor, path.name)
         kept = next(value for value in model.graph.output if value.name == name)
         copy = type(kept)()

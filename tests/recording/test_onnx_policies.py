@@ -1,6 +1,10 @@
 """Policies of ONNX files: plain layers as arrays, other graphs as they are, and what is refused."""
 
+import dataclasses
+import os
+import re
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +17,7 @@ import onnxruntime
 from helpers_own import CISTERN, forget_own
 from helpers_plugins import install
 from onnx import TensorProto, helper, numpy_helper
+from oodd_recording import onnx_files
 from oodd_recording.onnx_files import layers_of, read_model
 from oodd_recording.policies import load_policy
 
@@ -236,13 +241,106 @@ def test_what_is_no_policy_of_a_row_is_refused_and_leaves_no_file(
     assert not (cistern / name).exists()
 
 
-def test_weights_in_other_files_are_refused_inside_branches_too(cistern):
-    path = cistern / "actor.onnx"
+def split_in_two(path, nodes=MLP):
+    """Save a policy with all its weights in a second file, as torch does; return that file."""
     onnx.save_model(
-        graph(MLP), path, save_as_external_data=True, location="weights.bin", size_threshold=0
+        graph(nodes), path, save_as_external_data=True, location="weights.bin", size_threshold=0
     )
+    return path.with_name("weights.bin")
+
+
+def moved(path, **facts):
+    """Change where the first tensor of a policy in two files is said to be."""
+    model = onnx.load_model(path, load_external_data=False)
+    for entry in model.graph.initializer[0].external_data:
+        entry.value = facts.get(entry.key, entry.value)
+    path.write_bytes(model.SerializeToString())
+    return path
+
+
+BRANCHED = [*FIRST, ("Add", "u u", "v", {}), ("Mul", "u v", "s", {}), LAST]
+
+
+@pytest.mark.parametrize(("nodes", "name"), [(MLP, "actor.npz"), (BRANCHED, "kept.onnx")])
+def test_weights_in_a_second_file_are_taken_over(cistern, nodes, name):
+    path, rows = cistern / "actor.onnx", near_rows()
+    (cistern / "two").mkdir()
+    save(graph(nodes), path)
+    file = split_in_two(cistern / "two" / "actor.onnx", nodes)
+    assert file.stat().st_size > 300
+    assert imported(cistern / "two" / "actor.onnx", cistern / name) == 0
+    file.unlink()  # the policy does not need it any more
+    actions = [load_policy("cistern", cistern / name).act(row) for row in rows]
+    np.testing.assert_allclose(
+        actions, np.clip(outputs_of(path, rows), 0, 8), rtol=0, atol=2e-6 + 2.0**-17
+    )
+
+
+def test_a_cache_of_links_has_both_files(cistern):
+    (cistern / "blobs").mkdir()
+    (cistern / "snapshot").mkdir()
+    split_in_two(cistern / "blobs" / "actor.onnx")
+    for name in ("actor.onnx", "weights.bin"):
+        (cistern / "snapshot" / name).symlink_to(cistern / "blobs" / name)
+    assert imported(cistern / "snapshot" / "actor.onnx", cistern / "actor.npz") == 0
+
+
+@pytest.mark.parametrize(
+    ("facts", "message"),
+    [
+        ({"location": "../secret.bin"}, "expected a file in its own directory"),
+        ({"location": "/etc/passwd"}, "expected a file in its own directory"),
+        ({"location": "sub/weights.bin"}, "expected a file in its own directory"),
+        ({"location": ""}, "expected a file in its own directory"),
+        ({"location": ".."}, "expected a file in its own directory"),
+        ({"location": "linked.bin"}, "expected a file in its own directory"),
+        ({"location": "gone.bin"}, "cannot be read"),
+        ({"location": "pipe"}, "cannot be read"),
+        ({"location": "a\0b"}, "is no ONNX model"),
+        ({"offset": "-1"}, "cannot be read"),
+        ({"offset": "100000"}, "is no ONNX model"),
+        ({"offset": "ten"}, "is no ONNX model"),
+        ({"length": "8"}, "is no ONNX model"),
+        ({"length": "-1"}, "is no ONNX model"),
+        ({"length": "100000"}, "is no ONNX model"),
+    ],
+)
+def test_weights_elsewhere_than_in_a_file_beside_are_refused(cistern, facts, message, capsys):
+    folder = cistern / "policy"
+    folder.mkdir()
+    file = split_in_two(folder / "actor.onnx")
+    (folder / "sub").mkdir()
+    os.mkfifo(folder / "pipe")
+    for copy in (cistern / "secret.bin", folder / "sub" / "weights.bin"):
+        copy.write_bytes(file.read_bytes())
+    (folder / "linked.bin").symlink_to(cistern / "secret.bin")
+    assert imported(moved(folder / "actor.onnx", **facts), cistern / "actor.npz") == 4
+    assert message in " ".join(capsys.readouterr().err.split())
+    assert not (cistern / "actor.npz").exists()
+
+
+def test_files_of_weights_are_bounded_together(cistern, monkeypatch):
+    path = cistern / "actor.onnx"
+    file = split_in_two(path)
+    sizes = path.stat().st_size + sum(w.nbytes for w in WEIGHTS.values())
+    for most in (sizes - 1, sizes):
+        monkeypatch.setattr(onnx_files, "POLICY", dataclasses.replace(bounded.POLICY, most=most))
+        if most < sizes:
+            with pytest.raises(PolicyError, match="has, with other files, more than"):
+                read_model(path, beside=True)
+        else:
+            assert read_model(path, beside=True).graph.initializer[0].raw_data
+    with file.open("ab") as opened:
+        opened.truncate(2**40)  # a hole: only what tensors name is read
+    assert read_model(path, beside=True)
+
+
+def test_what_records_reads_one_file_alone(cistern):
+    """What onnxruntime gets as bytes would look for other files in the current directory."""
+    path = cistern / "actor.onnx"
+    split_in_two(path)
     with pytest.raises(PolicyError, match="keeps weights in other files, expected one file"):
-        read_model(path)
+        load_policy("cistern", path)
     inner = numpy_helper.from_array(WEIGHTS["b1"], "secret")
     inner.data_location = TensorProto.EXTERNAL
     node = helper.make_node("Constant", [], ["secret"], value=inner)
@@ -256,10 +354,44 @@ def test_weights_in_other_files_are_refused_inside_branches_too(cistern):
     path.write_bytes(model.SerializeToString())
     with pytest.raises(PolicyError, match="keeps weights in other files"):
         read_model(path)
+    sparse = graph(MLP)
+    sparse.graph.sparse_initializer.add().values.CopyFrom(inner)
+    path.write_bytes(sparse.SerializeToString())
+    with pytest.raises(PolicyError, match="keeps weights in other files"):
+        read_model(path)
     with path.open("wb") as file:
         file.truncate(bounded.POLICY.most + 1)  # a hole
     with pytest.raises(PolicyError, match="has more than 268435456 bytes"):
         read_model(path)
+
+
+def test_a_tensor_of_fewer_numbers_than_it_announces_is_refused(cistern):
+    model = graph(MLP)
+    model.graph.initializer[0].raw_data = b"1234"
+    with pytest.raises(PolicyError, match=r"actor\.onnx is no ONNX model"):
+        read_model(save(model, cistern / "actor.onnx"))
+
+
+@pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")  # torch's own
+def test_the_documented_line_of_torch_gives_a_policy(tmp_path, monkeypatch, capsys):
+    """It puts large weights into a second file."""
+    torch = pytest.importorskip("torch", reason="needs the extra train")
+    pytest.importorskip("onnxscript", reason="needs the extra onnx")
+    page = (Path(__file__).parents[2] / "docs/how-to/policies.md").read_text(encoding="utf-8")
+    (line,) = re.findall(r"`(torch\.onnx\.export\(.*?\))`", page)
+    monkeypatch.chdir(tmp_path)
+    layers = [torch.nn.Linear(4, 64), torch.nn.Tanh(), torch.nn.Linear(64, 2)]
+    actor = torch.nn.Sequential(*layers)
+    exec(line, {"torch": torch, "actor": actor})  # noqa: S102  a line of our own page
+    assert (tmp_path / "actor.onnx.data").stat().st_size > 1000
+    arguments = ["actor.onnx", "--env", "cartpole", "--output", "actor.npz"]
+    assert main(["policies", "import", *arguments]) == 0
+    assert "mean return" in capsys.readouterr().out
+    policy = load_policy("cartpole", "actor.npz")
+    rows = np.random.default_rng(0).normal(size=(50, 4)).astype(np.float32)
+    expected = actor(torch.from_numpy(rows)).detach().numpy()
+    values = np.array([policy._outputs(row) for row in rows])
+    np.testing.assert_allclose(values, expected, rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
