@@ -295,7 +295,8 @@ def read_intervals(path: Path) -> list[Interval]:
     ----------
     path
         The file. Whole numbers are rows from 0 on, numbers with a point are in the unit of the
-        stamps, other texts ISO 8601. An empty start is not known, an empty stop is the end.
+        stamps, other texts ISO 8601. An empty start is not known, an empty stop is the end. An
+        onset is a row, also where it is written as 3.0.
 
     Raises
     ------
@@ -318,6 +319,8 @@ def read_intervals(path: Path) -> list[Interval]:
     intervals = []
     for line, row in ((line, row) for line, row in rows if any(row)):
         cells = dict(itertools.zip_longest(header, row[: len(header)], fillvalue=""))
+        if start == "onset":  # programs write whole numbers so where the column is of floats
+            cells[start] = re.sub(r"\.0+$", "", cells[start])
         is_no_row = start == "onset" and natural(cells[start]) < 0
         if not cells["file"] or any(row[len(header) :]) or is_no_row:
             raise TrajectoryError(

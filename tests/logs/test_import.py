@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from oodd_live import Watchdog
 from oodd_logs.importing import import_data
+from oodd_logs.marks import read_intervals
 from oodd_logs.minari_files import export
 from oodd_logs.readers import quantity
 
@@ -353,6 +354,26 @@ def in_hdf5(part, change):
 def pipe(root):
     (root / "train.h5").unlink()
     os.mkfifo(root / "train.h5")
+
+
+def test_onsets_are_rows_also_where_they_are_written_as_floats(tmp_path):
+    as_csv(tmp_path)
+    onsets = tmp_path / "test" / "fog" / "onsets.csv"
+    rows = [line.split(",") for line in onsets.read_text().splitlines()]
+    expected = [(name, int(row), None, "") for name, row in rows[1:]]
+    for written in ("{}", "{}.0", "{}.000"):
+        lines = [f"{name},{written.format(row)}" for name, row in rows[1:]]
+        onsets.write_text("\n".join(["file,onset", *lines]))
+        intervals = read_intervals(onsets)
+        assert intervals == expected
+        assert all(isinstance(start, int) for _, start, _, _ in intervals)
+    for wrong in ("3.5", "-1.0", ".0", "3.0e1", "3.01", ""):
+        onsets.write_text(f"file,onset\nrun-0.csv,{wrong}")
+        with pytest.raises(TrajectoryError, match=r"onsets\.csv, line 2"):
+            read_intervals(onsets)
+    # Beside a start a number with a point is a time.
+    onsets.write_text("file,start,stop\nrun-0.csv,3.0,")
+    assert read_intervals(onsets) == [("run-0.csv", 3.0, None, "")]
 
 
 @pytest.mark.parametrize(
