@@ -370,16 +370,11 @@ def together(*options: Decorator) -> Decorator:
 
 
 expression_option: Final = click.option(
-    "-k",
-    "expression",
-    metavar="EXPR",
-    help="only cells whose id matches, such as 'hopper and not (iid or drift)'",
+    "-k", "expression", metavar="EXPR", help="only cells whose id matches: 'hopper and not iid'"
 )
 
 row_metrics_option: Final = click.option(
-    "--row-metrics",
-    is_flag=True,
-    help="add the rows' F1, alarm rates and VUS-PR, of splits without twins",
+    "--row-metrics", is_flag=True, help="without twins: add rows' F1, alarm rates and VUS-PR"
 )
 
 alarm_options: Final = together(

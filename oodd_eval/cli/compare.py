@@ -63,11 +63,7 @@ LOG_WIDTH: Final = 160
 @expression_option
 @click.option("--junit", type=OUTPUT_FILE, help="write JUnit XML, a test case per cell and metric")
 @click.option("--markdown", type=OUTPUT_FILE, help="write Markdown, for a pull request")
-@click.option(
-    "--write-reference",
-    type=OUTPUT_FILE,
-    help="write records to compare with later (compressed: .xz, .gz)",
-)
+@click.option("--write-reference", type=OUTPUT_FILE, help="write such a reference (also .xz, .gz)")
 @click.option("--keep", type=Names("metrics"), help="keep only these metrics, with their intervals")
 def compare(options: Options) -> int:
     """Compare two rows of some results, or results with a reference.

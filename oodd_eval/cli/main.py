@@ -16,7 +16,7 @@ from click.shell_completion import shell_complete
 
 from oodd_eval._version import __version__
 from oodd_eval.cli import Commands, Group, Options, command, say, write_section
-from oodd_eval.cli.streams import plain_streams
+from oodd_eval.cli.streams import open_streams, plain_streams
 from oodd_eval.errors import OoddError
 
 FIRST_STEPS: Final = (
@@ -141,6 +141,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if signal.getsignal(number) == signal.SIG_DFL:  # nohup has it ignored
             signal.signal(number, _interrupt)
     _leave_unreadable_directory()
+    if open_streams():
+        say("standard output is closed, so that nothing is printed there")
     with plain_streams():
         if question := os.environ.get(COMPLETION):
             with contextlib.suppress(OoddError):  # of a broken split, say: then there are no names
@@ -170,12 +172,18 @@ def _leave_unreadable_directory() -> None:
         sys.path[:] = [entry for entry in sys.path if entry]
 
 
-def _refusal(error: OSError) -> str:
-    """Return why the system refused a call, with the paths that it was about."""
-    paths = (str(path) for path in (error.filename, error.filename2) if path is not None)
-    reason = error.strerror or str(error) or type(error).__name__
-    advice = ": raise the limit (ulimit -n)" if error.errno == errno.EMFILE else ""
-    return f"{' and '.join(map(repr, paths)) or 'a call of the system'}: {reason}{advice}"
+def _refusal(error: Exception) -> str:
+    """Return why a command is not carried out; empty for an error of this program."""
+    if isinstance(error, OoddError):
+        return str(error)
+    if isinstance(error, OSError):
+        paths = (str(path) for path in (error.filename, error.filename2) if path is not None)
+        reason = error.strerror or str(error) or type(error).__name__
+        advice = ": raise the limit (ulimit -n)" if error.errno == errno.EMFILE else ""
+        return f"{' and '.join(map(repr, paths)) or 'a call of the system'}: {reason}{advice}"
+    if isinstance(error, MemoryError) or "start new thread" in str(error):
+        return "memory or threads do not suffice: raise ulimit -v and -u, or use fewer --jobs"
+    return ""
 
 
 def _exit_code(arguments: list[str]) -> int:
@@ -200,15 +208,10 @@ def _exit_code(arguments: list[str]) -> int:
     except click.UsageError as error:
         advice = f" (see {error.ctx.command_path} --help)" if error.ctx else ""
         return say(f"{error.format_message().removesuffix('.')}{advice}", 4)
-    except OoddError as error:
-        if "-v" in arguments:
+    except Exception as error:  # noqa: BLE001  the outermost: everything unforeseen ends here
+        reason = _refusal(error)
+        if "-v" in arguments or not reason:
             traceback.print_exc()
-        return say(str(error), 4)
-    except OSError as error:
-        if "-v" in arguments:
-            traceback.print_exc()
-        return say(_refusal(error), 4)
-    except Exception:  # noqa: BLE001  the outermost: everything unforeseen ends here
-        traceback.print_exc()
-        return say("internal error, please report it with the lines above", 3)
+        internal = "internal error, please report it with the lines above"
+        return say(reason or internal, 4 if reason else 3)
     return code

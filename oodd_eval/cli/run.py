@@ -93,13 +93,9 @@ class _Configurable(Command):
 @click.option("--limit", type=COUNT, help="use the first N trajectories of each part")
 @fit_options("30m")
 @click.option("--executor", default="local", help="local, or dask://HOST:PORT, a Dask cluster")
-@click.option(
-    "--sandbox", is_flag=True, help="run detectors without network, splits, results and home"
-)
+@click.option("--sandbox", is_flag=True, help="detectors see no network, splits, results or home")
 @click.option("--fresh", is_flag=True, help="fit again what the results directory has already")
-@click.option(
-    "--rolling", is_flag=True, help="judged nominal test episodes join the calibration, for logs"
-)
+@click.option("--rolling", is_flag=True, help="logs: judged nominal episodes join the calibration")
 @click.option("--intervals", is_flag=True, help="print 95 % intervals in the tables")
 @alarm_options
 @row_metrics_option

@@ -5,6 +5,7 @@ escape sequences move its cursor and rename its window, marks of direction excha
 """
 
 import contextlib
+import os
 import sys
 import unicodedata
 from collections.abc import Iterator
@@ -84,6 +85,19 @@ def plain_streams() -> Iterator[None]:
         yield
     finally:
         sys.stdout, sys.stderr = before
+
+
+def open_streams() -> bool:
+    """Lead closed standard streams nowhere, and tell whether standard output was closed.
+
+    A file that is opened later would take their places, and what is printed would go there.
+    """
+    closed = [name for name in ("stdin", "stdout", "stderr") if getattr(sys, name) is None]
+    for name in closed:
+        number = os.open(os.devnull, os.O_RDWR)  # the lowest that is free
+        os.set_inheritable(number, True)
+        setattr(sys, name, os.fdopen(number, "w"))
+    return "stdout" in closed
 
 
 def _plain(stream: Any) -> Any:

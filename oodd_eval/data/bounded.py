@@ -102,8 +102,10 @@ def read_bytes(path: Path, most: int, error: type[OoddError]) -> bytes:
     """Return the content of a plain file of at most `most` bytes; raise `error` for others."""
     try:
         with open_plain(path) as file:
-            large = os.fstat(file.fileno()).st_size > most
-            content = b"" if large else file.read(most + 1)
+            size = os.fstat(file.fileno()).st_size
+            large = size > most
+            # Reading takes memory for as many bytes as are asked for.
+            content = b"" if large else file.read(size + 1)
     except (OSError, ValueError) as problem:  # a name may hold what no file's name may
         why = getattr(problem, "strerror", None) or problem
         raise error(f"{str(path)!r} cannot be read: {why}") from None

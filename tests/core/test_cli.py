@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import json
 import math
 import os
 import re
@@ -21,7 +22,8 @@ from rich.console import Console
 from oodd_eval.cli import ALL, Group, info, listing
 from oodd_eval.cli import main as cli
 from oodd_eval.cli import run as run_module
-from oodd_eval.errors import UnknownNameError
+from oodd_eval.data.bounded import read_bytes
+from oodd_eval.errors import OoddError, UnknownNameError
 from oodd_eval.metrics.catalogue import PAPER
 from oodd_eval.scoring import display
 
@@ -328,6 +330,40 @@ def test_an_unforeseen_error_is_exit_code_3_with_a_traceback(run, monkeypatch):
     assert "internal error" in err
     # Of a request that is refused there is one with -v alone.
     assert "Traceback" in run(*CLOCK, "-v", "--env", "nowhere")[2]
+
+
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("can't start new thread")])
+def test_without_memory_or_threads_exit_code_4_says_what_to_raise(run, monkeypatch, error):
+    def fail(*_):
+        raise error
+
+    monkeypatch.setattr(listing, "rows", fail)
+    code, _, err = run("list", "envs")
+    advice = "memory or threads do not suffice: raise ulimit -v and -u, or use fewer --jobs"
+    assert (code, err) == (4, f"oodd-eval: {advice}\n")
+
+
+@pytest.mark.parametrize("closed", [">&-", "<&- >&-", ">&- 2>&-", "<&- >&- 2>&-"])
+def test_a_run_whose_output_is_closed_does_its_work(tiny_split, tmp_path, closed):
+    program = f'"$0" -m oodd_eval "$@" {closed}'
+    command = [*CLOCK[:-4], "--split", str(tiny_split), "--jobs", "1"]
+    done = subprocess.run(
+        ["sh", "-c", program, sys.executable, *command],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    said = "oodd-eval: standard output is closed, so that nothing is printed there\n"
+    assert (done.returncode, done.stdout) == (0, "")
+    assert done.stderr == ("" if "2>&-" in closed else said)
+    results = tmp_path / "oodd-results"
+    records = [json.loads(line) for line in (results / "records.jsonl").read_text().splitlines()]
+    assert [record["status"] for record in records] == ["ok"] * 8
+    assert (results / "report.md").read_text().startswith("# ")
+
+
+def test_a_small_file_takes_little_memory(tmp_path):
+    """Reading at most 10^12 bytes asked for as much memory at once."""
+    (tmp_path / "small").write_bytes(b"x")
+    assert read_bytes(tmp_path / "small", 10**15, OoddError) == b"x"
 
 
 def test_a_reader_that_leaves_ends_the_run_quietly(tiny_split, tmp_path):
