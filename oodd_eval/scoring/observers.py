@@ -45,7 +45,7 @@ def oodd_fit_progressed(unit: Unit, share: float) -> None:
     """Observe how far the fit of a unit is. Called at most twice a second for each unit.
 
     Detectors whose `fit` has a parameter ``progress`` tell; of others only the end is known. Scores
-    of an earlier run have no fit, and from a Dask cluster nothing is heard.
+    of an earlier run have no fit.
 
     Parameters
     ----------

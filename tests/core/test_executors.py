@@ -160,6 +160,37 @@ def stable(path):
     return [{k: v for k, v in p.items() if k not in VOLATILE} for p in plain]
 
 
+TELLS = """
+class Tells(Good):
+    def fit(self, nominal, progress):
+        super().fit(nominal)
+        progress(0.25)
+        time.sleep(1)
+
+@hookimpl
+def oodd_detectors():
+    return offer(tells=Tells)
+"""
+
+
+def test_from_a_cluster_is_heard_how_far_a_fit_is(tiny_split, monkeypatch, tmp_path):
+    plugin, heard = tmp_path / "plugin", []
+    install(monkeypatch, plugin, "tells", TELLS)
+    cluster = Cluster(tmp_path, environment(plugin, tmp_path / "fits"), workers=1)
+    try:
+        with unit_of(tiny_split, "tells") as job:
+            executor = remote.DaskExecutor(
+                cluster.address, RunSettings(), load_split(tiny_split), None
+            )
+            scored = executor(job, heard.append)
+            executor.close()
+    finally:
+        cluster.close()
+    assert scored.status == "ok", scored.reason
+    assert heard[:1] == [0.25]
+    assert heard == sorted(heard)
+
+
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks into /proc")
 def test_a_cluster_that_loses_a_worker_gives_the_same_records(tiny_split, monkeypatch, tmp_path):
     plugin, log = tmp_path / "plugin", tmp_path / "fits"

@@ -11,14 +11,15 @@ named in the order by digest and compared before any work.
 """
 
 import contextlib
-import functools
 import json
 import threading
 import warnings
 from dataclasses import asdict
+from functools import lru_cache, partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
+from uuid import uuid4
 
 from pydantic import TypeAdapter
 
@@ -86,13 +87,14 @@ class DaskExecutor(Executor):
             )
 
     def __call__(self, job: UnitJob, progress: Progress = ignore_progress) -> Scored:
-        """Score a unit on the cluster, from which no `progress` comes back."""
-        del progress
+        """Score a unit on the cluster; `progress` is called in a thread of the client's."""
         if not self._settings.fresh and (kept := job.kept(self._results)):
             return kept
         future: Any = None
+        topic = f"oodd-{uuid4().hex}"  # of messages on how far the fit is
         try:
-            order = order_of(job, self._split, self._settings.limits)
+            order = order_of(job, self._split, self._settings.limits) | {"topic": topic}
+            self._client.subscribe_topic(topic, lambda event: progress(event[1]))
             future = self._client.submit(on_worker, order, pure=False)
             self._running.add(future)
             if self._stopping.is_set():
@@ -113,6 +115,8 @@ class DaskExecutor(Executor):
             ) from error
         finally:
             self._running.discard(future)
+            with contextlib.suppress(Exception):
+                self._client.unsubscribe_topic(topic)
         if "refused" in outcome:
             raise ExecutorError(f"Dask worker {outcome['worker']}: {outcome['refused']}")
         file = ScoreFile(**{name: outcome[name] for name in _FILE})
@@ -174,18 +178,19 @@ def on_worker(order: Message) -> Message:
         task = worker.state.tasks.get(key)
         return task is None or task.state == "cancelled"
 
-    return {**run_order(order, withdrawn), "worker": worker.address}
+    progress = partial(worker.log_event, order["topic"])
+    return {**run_order(order, withdrawn, progress), "worker": worker.address}
 
 
-def run_order(order: Message, stop: Stop) -> Message:
+def run_order(order: Message, stop: Stop, progress: Progress = ignore_progress) -> Message:
     """Run an order on this machine, in a worker process of its own."""
     try:
-        return _scored(order, stop)
+        return _scored(order, stop, progress)
     except OoddError as error:
         return {"refused": str(error)}
 
 
-def _scored(order: Message, stop: Stop) -> Message:
+def _scored(order: Message, stop: Stop, progress: Progress) -> Message:
     if order["version"] != __version__:
         raise ExecutorError(
             f"it has oodd-eval {__version__}, expected {order['version']} as on this side: "
@@ -215,12 +220,12 @@ def _scored(order: Message, stop: Stop) -> Message:
         order["split"]["path"], order["split"]["name"], plan.split_digest, unit.environment
     )
     job = UnitJob(plan, unit, data, offer, order["streamed"], launcher)
-    scored = job(limits, stop, None, fresh=True)
+    scored = job(limits, stop, None, fresh=True, progress=progress)
     outcome = {"status": scored.status, "reason": scored.reason, "log": scored.log}
     return {**outcome, **{name: getattr(scored.file, name) for name in _FILE}}
 
 
-@functools.lru_cache(maxsize=16)
+@lru_cache(maxsize=16)
 def _launcher(text: str, memory: int | None) -> tuple[Launcher, Plugins]:
     """Make a launcher of what `Launcher.elsewhere` tells of it; units share it."""
     arguments = json.loads(text)
@@ -229,7 +234,7 @@ def _launcher(text: str, memory: int | None) -> tuple[Launcher, Plugins]:
     return launcher, plugins
 
 
-@functools.lru_cache(maxsize=16)
+@lru_cache(maxsize=16)
 def _environment(path: str, name: str, digest: str, environment: str) -> EnvironmentData:
     """Open one environment of the split with a digest; it stays open for the units to come."""
     looked = []
