@@ -4,10 +4,13 @@ A plug-in's spec may be of a class of its own, and so may each text in it. What 
 a copy.
 """
 
+import ast
 import functools
+import inspect
 import math
 import operator
 import re
+import sys
 import types
 from collections.abc import Callable, Mapping, Sequence, Sized
 from dataclasses import fields, is_dataclass, make_dataclass, replace
@@ -27,6 +30,30 @@ _LONGEST_TEXT: Final = 10_000  # characters of a default
 
 PLAIN_TYPES: Final = (bool, int, float, str, list, tuple, dict, types.NoneType, object)
 """Types of the values of parameters."""
+
+
+def reads_actions(factory: Callable[..., object]) -> bool:
+    """Tell whether the module that a factory is of reads actions of episodes.
+
+    A detector whose spec does not declare actions is given episodes without any: rows of width 0.
+
+    Parameters
+    ----------
+    factory
+        A detector's class, or a function that returns one.
+
+    Returns
+    -------
+    bool
+        Whether an attribute ``actions`` is read of anything but ``self``; False where there is no
+        source.
+    """
+    try:
+        source = inspect.getsource(sys.modules[factory.__module__])
+    except (OSError, TypeError, KeyError, AttributeError):
+        return False
+    reads = (n for n in ast.walk(ast.parse(source)) if isinstance(n, ast.Attribute))
+    return any(n.attr == "actions" and ast.unparse(n.value) != "self" for n in reads)
 
 
 def plain_spec(spec: object) -> DetectorSpec:

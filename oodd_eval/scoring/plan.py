@@ -26,6 +26,7 @@ from oodd_eval.names import Predicate, listed
 from oodd_eval.plugins.contract import CONTRACT, Alarm, DetectorSpec, Training
 from oodd_eval.plugins.discovery import Offer, Plugins
 from oodd_eval.plugins.parameters import parameters_by_detector, parameters_of, resolve_parameters
+from oodd_eval.plugins.specs import reads_actions
 from oodd_eval.results.identity import Cell, Setting
 from oodd_eval.results.record import Record
 
@@ -167,6 +168,7 @@ def make_plan(
     units: list[Unit] = []
     lacking: dict[str, list[str]] = {}  # reasons by detector
     taking: dict[tuple[str, str], list[str]] = {}  # environments by detector and its replacement
+    unaware: list[str] = []  # detectors that are not given the actions that they read
     for environment in environments:
         if not (conditions := _chosen(split.conditions(environment), anomalies)):
             continue
@@ -176,6 +178,10 @@ def make_plan(
                 lacking.setdefault(offer.spec.name, []).append(reason)
                 continue
             row = plugins.taking_actions(offer, params, detectors) if actions else (offer, params)
+            spec = row[0].spec
+            declared = spec.inputs != "observations" or spec.with_actions
+            if actions and not declared and reads_actions(spec.factory):
+                unaware.append(spec.name)
             if row[0] is not offer:
                 taking.setdefault((offer.spec.name, row[0].spec.name), []).append(environment)
             units += [
@@ -194,6 +200,11 @@ def make_plan(
         for (name, row), among in taking.items()
     )
     notes += tuple(f"{name} is left out: {r}" for name, rs in lacking.items() for r in rs)
+    notes += tuple(
+        f"{name} reads actions and is given none: its DetectorSpec has to declare them, by "
+        'inputs="observations+actions"'
+        for name in dict.fromkeys(unaware)
+    )
     return Plan(split.name, split.digest, tuple(units), split.groups, limit, strengths, notes)
 
 
@@ -233,13 +244,8 @@ def _parameters(offers: Sequence[Offer], parameters: Mapping[str, Any]) -> list[
     by_detector = parameters_by_detector([spec.name for spec in specs], parameters)
     having = {spec.name: parameters_of(spec.parameters) for spec in specs}
     for name in parameters:
-        lacking = [
-            spec.name
-            for spec in specs
-            if name in by_detector[spec.name]
-            and name not in having[spec.name]
-            and not spec.other_parameters
-        ]
+        without = [s for s in specs if name not in having[s.name] and not s.other_parameters]
+        lacking = [spec.name for spec in without if name in by_detector[spec.name]]
         if lacking and len(lacking) < len(specs):
             first = next(spec.name for spec in specs if spec.name not in lacking)
             raise UsageError(

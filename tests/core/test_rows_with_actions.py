@@ -27,6 +27,14 @@ def plan_of(detectors=("panel",), split="mini", environments=("hopper",), **sett
     )
 
 
+def bare_split(tmp_path):
+    """Write a split of logs without actions and return its directory."""
+    rng = np.random.default_rng(0)
+    logs = [rng.normal(size=(40, 2)) for _ in range(30)]
+    parts = {"train": logs[:10], "calibration": logs[10:20], "test": {"slip": logs[20:]}}
+    return import_frames("bench", **parts, output=tmp_path / "bench", report=len).path
+
+
 def test_where_there_are_actions_the_row_with_them_runs():
     named, plan = (
         plan_of(["panel-a"], parameters={"forecast": "linear"}),
@@ -55,11 +63,7 @@ def test_both_rows_run_where_both_are_named():
 
 
 def test_logs_without_actions_have_the_row_without(tmp_path):
-    rng = np.random.default_rng(0)
-    logs = [rng.normal(size=(40, 2)) for _ in range(30)]
-    parts = {"train": logs[:10], "calibration": logs[10:20], "test": {"slip": logs[20:]}}
-    opened = import_frames("bench", **parts, output=tmp_path / "bench", report=len)
-    plan = plan_of(split=opened.path, environments=["bench"])
+    plan = plan_of(split=bare_split(tmp_path), environments=["bench"])
     assert [unit.setting.detector for unit in plan.units] == ["panel"]
 
 
@@ -93,3 +97,39 @@ def test_rows_of_any_plugin_take_each_others_place(monkeypatch, tmp_path):
     install(monkeypatch, tmp_path, "mine", header + TWO_ROWS.format(name="other"))
     with pytest.raises(UnknownNameError, match="'mine-a'"):
         plan_of(["mine"])
+
+
+READS = """
+def rows(x):
+    return np.hstack([x.observations[:-1], x.actions])
+
+class Mine(Good):
+    actions = 0
+    def fit(self, nominal):
+        self.actions = sum(rows(x).shape[1] for x in nominal)
+
+@hookimpl
+def oodd_detectors():
+    return [DetectorSpec("mine", Mine, ""), DetectorSpec("declares", Mine, "", inputs=BOTH)]
+
+BOTH = "observations+actions"
+"""
+
+
+def test_a_detector_that_reads_actions_and_does_not_declare_them_is_named(monkeypatch, tmp_path):
+    install(monkeypatch, tmp_path, "mine", READS)
+    (note,) = plan_of(["mine", "declares", "rf", "mewma-a"]).notes
+    assert note == (
+        "mine reads actions and is given none: its DetectorSpec has to declare them, by "
+        'inputs="observations+actions"'
+    )
+
+
+def test_a_detector_that_looks_at_its_own_actions_alone_is_not_named(monkeypatch, tmp_path):
+    install(monkeypatch, tmp_path, "mine", READS.replace(", x.actions", ", self.actions"))
+    assert not plan_of(["mine"]).notes
+
+
+def test_logs_without_actions_have_none_to_declare(monkeypatch, tmp_path):
+    install(monkeypatch, tmp_path / "plugin", "mine", READS)
+    assert not plan_of(["mine"], bare_split(tmp_path), ["bench"]).notes

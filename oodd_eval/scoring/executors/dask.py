@@ -115,8 +115,6 @@ class DaskExecutor(Executor):
             ) from error
         finally:
             self._running.discard(future)
-            with contextlib.suppress(Exception):
-                self._client.unsubscribe_topic(topic)
         if "refused" in outcome:
             raise ExecutorError(f"Dask worker {outcome['worker']}: {outcome['refused']}")
         file = ScoreFile(**{name: outcome[name] for name in _FILE})
