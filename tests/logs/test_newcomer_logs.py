@@ -33,6 +33,9 @@ def test_the_page_shows_what_its_commands_print_and_finds_the_slip(session, caps
     table = re.search(r"```text\nlogs: csv.*?\n\n(.*?)```", TEXT, re.DOTALL)[1]
     for line in table.splitlines()[2:]:
         assert line.rstrip() in printed[0], f"the page shows {line!r}"
+    results = re.search(r"```text\ndetector(.*?)```", SECTION, re.DOTALL)[1]
+    for row in results.splitlines()[2:]:
+        assert " ".join(row.split()) in " ".join(printed[3].split()), f"the page shows {row!r}"
     said = " ".join(printed[0].split())
     assert re.search(r"a row every 0\.02 s in run-5\.csv", said)  # the others 0.01 s
     assert re.search(r"before row 900 of run-3\.csv", said)  # the gap
