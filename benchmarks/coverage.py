@@ -1,8 +1,8 @@
 """Coverage of the 95 % intervals, by simulation: ``python benchmarks/coverage.py``.
 
 Each problem draws the terms of a metric for a number of test seeds per environment and asks whether
-its interval contains the true value. The table stands in benchmarks/README.md. Exit code 1 where a mean
-on a board is covered in less than 93 %. An hour.
+its interval contains the true value. The table stands in benchmarks/README.md. Exit code 1 where a
+mean on a board is covered in less than 93 %. An hour.
 """
 
 from __future__ import annotations
