@@ -62,7 +62,9 @@ def listed(names: Sequence[str], most: int = 4) -> str:
 def select(kind: str, patterns: str, known: Iterable[str]) -> list[str]:
     """Return the known names that a comma list of names and globs, or ``"all"``, selects, in order.
 
-    >>> select("environment", "hopper,a*", ["acrobot", "ant", "hopper"])
+    A glob without a slash stands for no long name, ``PLUGIN/NAME``.
+
+    >>> select("environment", "hopper,a*", ["acrobot", "ant", "hopper", "a/arm"])
     ['hopper', 'acrobot', 'ant']
     """
     names = list(known)
@@ -71,7 +73,8 @@ def select(kind: str, patterns: str, known: Iterable[str]) -> list[str]:
         if not pattern:
             continue
         # In a glob the brackets of a name such as "column:pos_innov[0]" are a set of letters.
-        exact = [pattern] if pattern in names else fnmatch.filter(names, pattern)
+        globbed = [n for n in names if "/" in pattern or ":" in n or "/" not in n]
+        exact = [pattern] if pattern in names else fnmatch.filter(globbed, pattern)
         matches = names if pattern == "all" else exact
         if not matches:
             raise UnknownNameError(kind, pattern, names)

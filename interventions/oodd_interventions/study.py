@@ -34,13 +34,14 @@ from oodd_recording.registered import info_of
 from oodd_eval.data import layout
 from oodd_eval.data.facts import Group, SplitDefinition
 from oodd_eval.data.files import only_writer, write_text
+from oodd_eval.data.offers import OfferedSpecs
 from oodd_eval.data.parts import EnvironmentData
-from oodd_eval.data.registry import inner_of, register
+from oodd_eval.data.registry import EnvironmentSpec, environment_spec, inner_of
 from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import SimulationError, UnknownNameError, UsageError
 from oodd_eval.metrics.alarms import Calibration, GuaranteedAlarm
 from oodd_eval.metrics.cusum import Standardization
-from oodd_eval.names import comma_list, read, select, whole_number
+from oodd_eval.names import comma_list, listed, read, select, whole_number
 from oodd_eval.plugins.contract import StorableDetector
 from oodd_eval.plugins.discovery import Plugins, describe, discover
 from oodd_eval.plugins.state import pack, read_state, write_state
@@ -222,7 +223,6 @@ def intervene(
     if not 0 < level < 1:
         raise UsageError(f"level is {level!r}, expected a share of episodes between 0 and 1")
     opened, plugins = load_split(split), discover()
-    register([spec for spec, _ in plugins.custom_specs.values()])
     detector_names = plugins.select(comma_list(detectors), opened.columns)
     if recorded := [name for name in detector_names if columns_of(name)]:
         raise UsageError(
@@ -232,6 +232,11 @@ def intervene(
     environment_names, kinds = opened.select(comma_list(environments), comma_list(kinds or "all"))
     for environment in environment_names:
         _check_recorded(opened, environment, base)
+    specs = plugins.custom_specs
+    pairs = ((e, condition) for e in environment_names for condition in opened.conditions(e))
+    long_kinds = [opened.long_name(e, condition.anomaly) for e, condition in pairs]
+    specs.register(map(opened.long_name, environment_names), long_kinds)
+    for environment in environment_names:
         measure(environment, load_policy(environment))
     plan = make_plan(
         plugins,
@@ -245,11 +250,12 @@ def intervene(
     broken = {f"plug-in {b.plugin!r} of {b.distribution}": b.reason for b in plugins.broken}
     act_names = _selected(comma_list(acts or "all"), offered, broken)
     study = Study(opened.path, Path(output), seeds, base, level)
+    acts_of = functools.partial(suiting, offered, act_names, specs)
     cells = [
         StudyCell(study, unit, plan.blank(unit, condition, status="ok"), act)
         for unit in plan.units
         for condition in unit.conditions
-        for act in suiting(offered, act_names, unit.environment, plan.groups[condition.anomaly])
+        for act in acts_of(environment_spec(unit.environment), plan.groups[condition.anomaly])
     ]
     with only_writer(study.output):
         for cell in cells if fresh else ():
@@ -260,20 +266,23 @@ def intervene(
     return Interventions(study.output, [cell for cell in done if cell is not None], reasons)
 
 
-def offered_acts(plugins: Plugins) -> list[ActSpec]:
-    """Return the shipped acts and those of plug-ins; several may share a name."""
-    acts = [*ACTS]
+def offered_acts(plugins: Plugins) -> list[tuple[ActSpec, str]]:
+    """Return the shipped acts and those of plug-ins, with the plug-in; several may share a name."""
+    acts = [(act, "") for act in ACTS]
     _ = plugins.offers  # loads all
     for plugin in list(plugins.loaded.values()):
         with plugins.blaming(plugin.point):
-            acts += plugin.listed("oodd_acts", ActSpec)
+            acts += [(act, plugin.point.name) for act in plugin.listed("oodd_acts", ActSpec)]
     return acts
 
 
-def _selected(names: str, offered: Sequence[ActSpec], broken: Mapping[str, str]) -> list[str]:
-    """Return the names of acts; those that nobody offers may be a broken plug-in's."""
+def _selected(
+    names: str, offered: Sequence[tuple[ActSpec, str]], broken: Mapping[str, str]
+) -> list[str]:
+    """Return short or long names of acts; those that nobody offers may be a broken plug-in's."""
+    short = dict.fromkeys(act.name for act, _ in offered)
     try:
-        return select("act", names, dict.fromkeys(act.name for act in offered))
+        return select("act", names, [*short, *(f"{p}/{act.name}" for act, p in offered if p)])
     except UnknownNameError as error:
         if broken:
             plugins = "; ".join(f"{plugin}: {reason}" for plugin, reason in broken.items())
@@ -288,13 +297,30 @@ def source_of(act: ActSpec) -> str:
 
 
 def suiting(
-    acts: Sequence[ActSpec], names: Sequence[str], environment: str, group: Group
+    acts: Sequence[tuple[ActSpec, str]],
+    names: Sequence[str],
+    specs: OfferedSpecs,
+    environment: EnvironmentSpec,
+    group: Group,
 ) -> tuple[ActSpec, ...]:
-    """Return the named acts that suit: of one name the last one that is the environment's own."""
-    suited = [act for act in acts if act.name in names and group in act.groups]
-    general = {act.name: act for act in suited if not act.environments}
-    special = {act.name: act for act in suited if environment in act.environments}
-    return tuple((general | special).values())
+    """Return the named acts that suit, of each short name one.
+
+    First come those for the environment, then those of its plug-in, then the shipped ones. Of one
+    plug-in the last is taken; `UsageError` where two plug-ins are left.
+    """
+    suited: dict[str, dict[tuple[bool, ...], dict[str, ActSpec]]] = {}
+    for act, plugin in acts:
+        is_named = act.name in names or f"{plugin}/{act.name}" in names
+        suits = specs.is_for(act, plugin, environment) and group in act.groups
+        if is_named and suits:
+            rank = bool(act.environments), plugin == environment.plugin, not plugin
+            suited.setdefault(act.name, {}).setdefault(rank, {})[plugin] = act
+    first = [by_rank[max(by_rank)] for by_rank in suited.values()]
+    for by_plugin in first:
+        if len(by_plugin) > 1:
+            long = listed([f"{plugin}/{act.name}" for plugin, act in by_plugin.items()])
+            raise UsageError(f"several plug-ins have an act of one name, {long}: name one of them")
+    return tuple(act for by_plugin in first for act in by_plugin.values())
 
 
 def _run(cells: Sequence[StudyCell], jobs: int | None, observer: Progress) -> dict[str, str]:

@@ -56,12 +56,11 @@ def info(options: Options) -> int:
         custom = plugins.custom_specs
         imported = {env: (split, entry) for env, split, entry in imported_environments()}
         try:
-            if name in custom and name in imported:  # logs may have a plug-in's name
-                lines = chain(_custom(*custom[name]), _imported(name, *imported[name]))
-            elif name in custom:
-                lines = _custom(*custom[name])
-            elif name in imported:
-                lines = _imported(name, *imported[name])
+            meanings = [] if name in plugins.offers else custom.meanings(name)
+            parts = [_custom(spec, plugins.origin(spec.plugin)) for spec in meanings]
+            parts += [_imported(name, *imported[name])] if name in imported else []
+            if parts:  # logs may have a plug-in's name
+                lines = chain(*parts)
             elif options.wide and name in split_directories():
                 described: int = load("oodd_eval.cli.data:info").handler(options)
                 return described
@@ -70,8 +69,9 @@ def info(options: Options) -> int:
             else:
                 lines = _detector(plugins.offer(name))
         except UnknownNameError:
-            names = [*ENVIRONMENTS, *ANOMALIES, *custom, *imported, *plugins.offers]
-            names += [*SPLITS, *split_directories(), *NAMES, *INTERVENTIONS]
+            names = [*ENVIRONMENTS, *ANOMALIES, *(spec.name for spec in custom.specs)]
+            names += [*imported, *plugins.offers, *SPLITS, *split_directories()]
+            names += [*NAMES, *INTERVENTIONS]
             close = near(name, names)
             meant = f": did you mean {' or '.join(map(repr, close))}?" if close else ":"
             kinds = "detector, environment, anomaly, split or metric"

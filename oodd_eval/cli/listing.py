@@ -44,7 +44,7 @@ def list_names(options: Options) -> int:
     if kind == "detectors":
         say_notes(plugins.notes)
     print(tabulate(rows(kind, plugins), tablefmt="plain", disable_numparse=True))
-    return int(kind == "detectors" and bool(plugins.broken))
+    return int(kind in KINDS[:3] and bool(plugins.broken))
 
 
 def rows(kind: str, plugins: Plugins) -> Rows:
@@ -55,25 +55,27 @@ def rows(kind: str, plugins: Plugins) -> Rows:
         case "envs":
             for e in ENVIRONMENTS.values():
                 yield e.id, e.simulator, f"{e.observation_dim} sensors, {e.policy} policy"
-            for env, origin in _custom(plugins, EnvironmentSpec):
-                yield env.name, origin, f"{counted(len(env.sensors), 'sensor(s)')}, its own policy"
-            yield from _imported()
+            for env, name, origin in _custom(plugins, EnvironmentSpec):
+                yield name, origin, f"{counted(len(env.sensors), 'sensor(s)')}, its own policy"
+            yield from (*_imported(), *_broken(plugins))
         case "anomalies":
             for a in ANOMALIES.values():
                 yield a.id, a.group, a.summary
-            for anomaly, origin in _custom(plugins, AnomalySpec):
-                yield anomaly.name, anomaly.group, f"{anomaly.summary} ({origin})"
+            for anomaly, name, origin in _custom(plugins, AnomalySpec):
+                yield name, anomaly.group, f"{anomaly.summary} ({origin})"
+            yield from _broken(plugins)
         case "splits":
             yield from _splits()
         case "metrics":
             yield from _metrics()
 
 
-def _custom(plugins: Plugins, kind: type[T]) -> Iterable[tuple[T, str]]:
-    """Yield the environments, or the anomalies, of plug-ins with their origin."""
-    for spec, origin in plugins.custom_specs.values():
+def _custom(plugins: Plugins, kind: type[T]) -> Iterable[tuple[T, str, str]]:
+    """Yield the environments, or the anomalies, of plug-ins with their name and origin."""
+    offered = plugins.custom_specs
+    for spec in offered.specs:
         if isinstance(spec, kind):
-            yield spec, origin
+            yield spec, offered.shortest_name(spec), plugins.origin(spec.plugin)
 
 
 def _imported() -> Rows:
@@ -94,6 +96,10 @@ def _detectors(plugins: Plugins) -> Rows:
         yield name, _origin(offer), marks + offer.spec.summary
     for name, origin, forms in plugins.spec_forms():
         yield f"({name})", origin, forms
+    yield from _broken(plugins)
+
+
+def _broken(plugins: Plugins) -> Rows:
     yield from ((b.plugin, b.distribution, f"[broken plug-in] {b.reason}") for b in plugins.broken)
 
 

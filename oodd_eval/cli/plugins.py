@@ -3,7 +3,6 @@
 from collections.abc import Callable, Collection
 
 from oodd_eval.cli import Options, say, say_notes
-from oodd_eval.data.registry import Spec, register
 from oodd_eval.plugins.discovery import Plugins, discover
 
 
@@ -15,10 +14,3 @@ def discovered(options: Options, find: Callable[[Collection[str]], Plugins] = di
         lambda b: say(f"plug-in {b.plugin!r} of {b.distribution} is broken: {b.reason}")
     )
     return plugins
-
-
-def register_custom(options: Options) -> list[Spec]:
-    """Make environments and anomalies of plug-ins known in this process; return them."""
-    specs = [spec for spec, _ in discovered(options).custom_specs.values()]
-    register(specs)
-    return specs

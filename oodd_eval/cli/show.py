@@ -84,9 +84,11 @@ def show(options: Options) -> int:
     results = ResultsDirectory(options.directory)
     records = results.records()
     environments = in_order([*ENVIRONMENTS, *(r.environment for r in records)], ENVIRONMENTS)
-    selected = select("environment", options.env, environments)
+    long = _long_names(records, results, options.split) if "/" in options.env else {}
+    selected = {*select("environment", options.env, [*environments, *long.values()])}
     passes = expression(options.expression)
-    records = [r for r in records if r.environment in selected and passes(str(r.cell))]
+    records = [r for r in records if {r.environment, long.get(r.identity)} & selected]
+    records = [r for r in records if passes(str(r.cell))]
     units: dict[str, str] = {}
     splits: dict[str, Split] = {}
     if not options.stored:
@@ -174,6 +176,14 @@ def _splits(records: list[Record], results: ResultsDirectory, at: str | None) ->
     """Open the splits of records, by their digests."""
     of_digest = {r.split_digest: r for r in records}
     return {d: load_split(at) if at else results.split_of(r) for d, r in of_digest.items()}
+
+
+def _long_names(
+    records: list[Record], results: ResultsDirectory, at: str | None
+) -> dict[object, str]:
+    """Return the long names of environments, as the splits have them, by records."""
+    splits = _splits(records, results, at)
+    return {r.identity: splits[r.split_digest].long_name(r.environment) for r in records}
 
 
 def _recomputed(

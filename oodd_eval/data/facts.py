@@ -353,6 +353,9 @@ class LogFacts:
 WORLDS: Final = ("arm", "drone", "tank")
 """Environments of the plug-in `oodd_worlds`, of which splits are published, too."""
 
+LONG_NAMES: Final = MappingProxyType({name: f"worlds/{name}" for name in WORLDS})
+"""What short names mean in the definitions of published splits and seasons."""
+
 _SPLITS: Final = (
     # Protocol 1 used the seed bases 1 to 3: nothing tuned on its splits has seen these episodes.
     SplitDefinition("mini", 40, 40, 10, 300, 4),

@@ -228,10 +228,9 @@ def own_facts(
     kinds = {kind: group for kind, group in groups.items() if kind not in ANOMALIES}
     if environment in ENVIRONMENTS and not kinds:
         return {}
-    roles = {} if environment in ENVIRONMENTS else {"roles": [*roles_of(sensors)]}
-    return {"own": {"discrete": discrete, "anomalies": kinds}} | (
-        roles if any(roles.values()) else {}
-    )
+    described = {"own": {"discrete": discrete, "anomalies": kinds}}
+    roles = [] if environment in ENVIRONMENTS else [*roles_of(sensors)]
+    return described | ({"roles": roles} if roles else {})
 
 
 def roles_in(environment: str, entry: Mapping[str, Any]) -> tuple[Role, ...]:
@@ -446,6 +445,7 @@ def _manifest_schema() -> Any:
         "logs": logs,
         "recordings": by_name(parts, runs),
         "ledger": core_schema.list_schema(text),  # what became of logs, a line each
+        "plugins": by_name(text, text),  # by kind of anomaly, and the environment's under ""
     }
     for key, optional in optional_fields.items():
         environment["fields"][key] = core_schema.typed_dict_field(optional, required=False)

@@ -1,31 +1,22 @@
 """The registry of environments and kinds of anomalies that episodes can be recorded with.
 
 Plug-ins offer them as specs through the hooks ``oodd_environments`` and ``oodd_anomalies``; the
-benchmark's are those of the plug-in `oodd_recording.benchmark`. Nothing is simulated here, so that
-listing them stays quick. Recording takes place in processes of their own, which import what a spec
-names again: its functions stand at the top level of a module.
+benchmark's are those of the plug-in `oodd_recording.benchmark`. They are known by short names here:
+what names mean that several plug-ins have is decided before (`oodd_eval.data.offers`). Nothing is
+simulated here, so that listing them stays quick. Recording takes place in processes of their own,
+which import what a spec names again: its functions stand at the top level of a module.
 """
 
 from __future__ import annotations
 
 import functools
 import inspect
-import re
-import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
-from oodd_eval.data.facts import (
-    ANOMALIES,
-    ENVIRONMENTS,
-    NAME_PATTERN,
-    EnvironmentInfo,
-    Group,
-    Quantity,
-)
-from oodd_eval.errors import PluginError
+from oodd_eval.data.facts import EnvironmentInfo, Group, Quantity
 from oodd_eval.names import check_known
 
 if TYPE_CHECKING:
@@ -88,6 +79,8 @@ class EnvironmentSpec:
         sections, from the first ``##`` on, follow the page's first table.
     picture
         Called as ``picture()``; returns the picture of its page: an SVG as text, or a PNG as bytes.
+    plugin
+        Name of its plug-in, which is filled in when the plug-in is loaded.
     """
 
     name: str
@@ -103,6 +96,7 @@ class EnvironmentSpec:
     packages: tuple[str, ...] = ()
     description: str = ""
     picture: Callable[[], str | bytes] | None = None
+    plugin: str = ""
 
 
 class Fault:
@@ -211,7 +205,8 @@ class AnomalySpec:
         comes from the generator `rng` and does not depend on the strength. ``simulator.env`` is the
         environment.
     environments
-        Names of the environments that it can be recorded in; empty for any.
+        Names of the environments that it can be recorded in; empty for any. Of several that share a
+        short name, that of the same plug-in is meant.
     units
         Unit and bound where they differ: by the name of an environment, or for ``"discrete"`` or
         ``"continuous"`` actions.
@@ -229,6 +224,8 @@ class AnomalySpec:
     intermittent
         Whether there is another kind besides, its name followed by ``-intermittent``: on for 10
         rows and off for 40.
+    plugin
+        Name of its plug-in, which is filled in when the plug-in is loaded.
     """
 
     name: str
@@ -245,6 +242,7 @@ class AnomalySpec:
     lasts: int = 0
     pulses: tuple[int, int] | None = None
     intermittent: bool = False
+    plugin: str = ""
 
     def scale(self, environment: EnvironmentInfo) -> tuple[str, float]:
         """Return unit and bound of the strength in an environment.
@@ -260,10 +258,8 @@ class AnomalySpec:
             The text of the unit, and the number.
         """
         family = "discrete" if environment.discrete else "continuous"
-        unit, bound = self.units.get(environment.id) or self.units.get(
-            family, (self.unit, self.bound)
-        )
-        return unit, bound
+        default = self.units.get(family, (self.unit, self.bound))
+        return self.units.get(environment.id, default)
 
 
 Spec = EnvironmentSpec | AnomalySpec
@@ -271,64 +267,18 @@ Spec = EnvironmentSpec | AnomalySpec
 PULSES: Final = (10, 40)  # rows on and off of intermittent kinds
 
 
-def with_intermittent(specs: Iterable[Spec]) -> Iterator[Spec]:
-    """Yield each spec, and the intermittent kind beside one that has it."""
-    for spec in specs:
-        yield spec
-        if isinstance(spec, AnomalySpec) and spec.intermittent:
-            on, off = PULSES
-            yield replace(
-                spec,
-                name=f"{spec.name}-intermittent",
-                summary=f"as {spec.name}, on for {on} rows and off for {off}",
-                pulses=PULSES,
-                intermittent=False,
-            )
+def long_name(spec: Spec) -> str:
+    """Return the name that no other plug-in can have; of what is no plug-in's, its name."""
+    return f"{spec.plugin}/{spec.name}" if spec.plugin else spec.name
+
+
+def short_name(name: str) -> str:
+    """Return the short name of a short or long one."""
+    return name.rpartition("/")[2]
 
 
 _environments: Final[dict[str, EnvironmentSpec]] = {}
 _anomalies: Final[dict[str, AnomalySpec]] = {}
-
-
-def check_spec(spec: Spec) -> None:
-    """Raise `PluginError` for a wrong or taken name, functions of no module, and wrong numbers."""
-    kind = "environment" if isinstance(spec, EnvironmentSpec) else "anomaly"
-    taken = {"nominal", *(ENVIRONMENTS if isinstance(spec, EnvironmentSpec) else ANOMALIES)}
-    if spec.name in taken or not re.fullmatch(NAME_PATTERN, spec.name):
-        raise PluginError(
-            f"{spec.name!r} cannot be the name of a custom {kind}, expected lower-case letters, "
-            "digits and hyphens, and no name of the benchmark"
-        )
-    if problem := _problem_of(spec):
-        raise PluginError(f"{kind} {spec.name!r} has {problem}")
-    for function in functions_of(spec):
-        inner = inner_of(function)
-        name, home = getattr(inner, "__qualname__", ""), getattr(inner, "__module__", "")
-        if (
-            not name
-            or getattr(sys.modules.get(home), name, None) is not inner
-            or not file_of(inner)
-        ):
-            raise PluginError(
-                f"{kind} {spec.name!r} names {inner!r:.80}, expected a function or class at the "
-                "top level of a module in a file, which other processes can import"
-            )
-
-
-def _problem_of(spec: Spec) -> str:
-    """Return what is wrong with a task, or with the rows of a kind; empty if nothing is."""
-    if isinstance(spec, EnvironmentSpec):
-        tasks = get_args(Task)
-        is_task = spec.task in tasks
-        return "" if is_task else f"task {spec.task!r}, expected one of {', '.join(tasks)}"
-    pulses = (1, 1) if spec.pulses is None else tuple(spec.pulses)
-    if min(spec.ramp, spec.lasts) < 0:
-        return f"ramp {spec.ramp} and lasts {spec.lasts}, expected numbers of rows from 0"
-    if len(pulses) != 2 or min(pulses) < 1:
-        return f"pulses {spec.pulses}, expected two numbers of rows from 1: on, off"
-    if spec.intermittent and spec.pulses is not None:
-        return "pulses, so it is intermittent itself: expected intermittent=False"
-    return ""
 
 
 def register(specs: Iterable[Spec]) -> None:

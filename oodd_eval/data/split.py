@@ -11,9 +11,10 @@ from typing import Any, Final
 
 from oodd_eval.data import layout
 from oodd_eval.data.condition import NOMINAL, Condition, in_suite_order
-from oodd_eval.data.facts import ENVIRONMENTS, SPLITS, Group, Role, in_order
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, LONG_NAMES, SPLITS, Group, Role, in_order
 from oodd_eval.data.layout import MANIFEST, GroupCheck
 from oodd_eval.data.parts import NAMES, TRAIN, TWINS, EnvironmentData, check_twins, conditions_in
+from oodd_eval.data.registry import short_name
 from oodd_eval.data.stored import StoredFile
 from oodd_eval.errors import (
     DigestError,
@@ -99,7 +100,7 @@ def splits_with(environment: str) -> list[str]:
     Parameters
     ----------
     environment
-        Its name.
+        Its short or long name.
 
     Returns
     -------
@@ -109,7 +110,7 @@ def splits_with(environment: str) -> list[str]:
     names = []
     for name, directory in split_directories().items():
         with contextlib.suppress(SplitError):
-            if environment in Split(directory).environments:
+            if environment in Split(directory).environment_names:
                 names.append(name)
     return names
 
@@ -186,6 +187,34 @@ class Split:
         """Names of the environments: the benchmark's in its order, then others in theirs."""
         return tuple(in_order(self.manifest["environments"], ENVIRONMENTS))
 
+    @property
+    def environment_names(self) -> tuple[str, ...]:
+        """Names of the environments: short ones, then those with their plug-in, ``PLUGIN/NAME``."""
+        return (*self.environments, *map(self.long_name, self.environments))
+
+    def long_name(self, environment: str, anomaly: str = "") -> str:
+        """Return the long name of an environment, or of an anomaly in it.
+
+        Parameters
+        ----------
+        environment
+            One of `environments`.
+        anomaly
+            Name of a kind or condition.
+
+        Returns
+        -------
+        str
+            ``PLUGIN/NAME``; the name alone where it is the benchmark's, or the split does not say
+            whose it is.
+        """
+        entry, kind = self.manifest["environments"][environment], anomaly.partition("@")[0]
+        plugin = entry.get("plugins", {}).get(kind, "")
+        named = self.manifest["definition"].get("environments", ())
+        if environment in named and kind not in ANOMALIES:  # older ones lack what is known of them
+            plugin = plugin or LONG_NAMES.get(environment, "").rpartition("/")[0]
+        return f"{plugin}/{anomaly or environment}".lstrip("/")
+
     def conditions(self, environment: str) -> tuple[Condition, ...]:
         """Return the conditions of an environment: anomalies, each at its strengths.
 
@@ -244,6 +273,35 @@ class Split:
             groups |= layout.groups_of(entry)
         return groups
 
+    def select_environments(self, names: str) -> list[str]:
+        """Return the environments that a comma list of names and globs, or ``"all"``, selects.
+
+        Parameters
+        ----------
+        names
+            Text as on the command line, of short and long names.
+
+        Returns
+        -------
+        list of str
+            Short names.
+
+        Raises
+        ------
+        UsageError
+            When one is unknown; where another split has it, that is named.
+        """
+        try:
+            selected = select("environment", names, self.environment_names)
+        except UnknownNameError as error:
+            if holders := splits_with(error.name):
+                raise UsageError(
+                    f"split {self.name} has no environment {error.name!r}: it is in split "
+                    f"{' and '.join(holders)}, pass --split {holders[0]}"
+                ) from None
+            raise
+        return list(dict.fromkeys(map(short_name, selected)))
+
     def select(self, environments: str, anomalies: str) -> tuple[list[str], list[str]]:
         """Return the names that comma lists, globs or ``"all"`` select.
 
@@ -262,21 +320,15 @@ class Split:
         UsageError
             When something is unknown, or the environments have nominal episodes only.
         """
-        try:
-            selected = select("environment", environments, self.environments)
-        except UnknownNameError as error:
-            if not (holders := splits_with(error.name)):
-                raise
-            raise UsageError(
-                f"split {self.name} has no environment {error.name!r}: it is in split "
-                f"{' and '.join(holders)}, pass --split {holders[0]}"
-            ) from None
+        selected = self.select_environments(environments)
         if not (anomaly_names := self._names(*selected)):
             raise UsageError(
                 f"split {self.name} has no anomalous episodes of {', '.join(selected)}, expected "
                 "some to evaluate detectors on: import them, or fit a watchdog on what there is"
             )
-        return selected, select("anomaly", anomalies, anomaly_names)
+        long = [self.long_name(e, name) for e in selected for name in self._names(e)]
+        chosen = select("anomaly", anomalies, [*anomaly_names, *long])
+        return selected, list(dict.fromkeys(map(short_name, chosen)))
 
     def _names(self, *environments: str) -> tuple[str, ...]:
         conditions = in_suite_order(c for e in environments for c in self.conditions(e))

@@ -11,9 +11,10 @@ import fnmatch
 import inspect
 import os
 import re
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.machinery import PathFinder
 from importlib.metadata import EntryPoint
 from importlib.util import find_spec
@@ -33,6 +34,7 @@ from oodd_eval.plugins.specs import MOST_SPECS, plain_spec
 
 if TYPE_CHECKING:
     # A worker discovers detectors, and is to know nothing of environments.
+    from oodd_eval.data.offers import OfferedSpecs
     from oodd_eval.data.registry import Spec
 
 
@@ -148,20 +150,13 @@ class Plugin:
         raise PluginError(f"{self} made {spec!r:.80} of {text!r}, expected {expected}")
 
     def custom_specs(self) -> list[Spec]:
-        """Return its environments and anomalies, checked."""
-        from oodd_eval.data.registry import (  # noqa: PLC0415
-            AnomalySpec,
-            EnvironmentSpec,
-            check_spec,
-            with_intermittent,
-        )
+        """Return its environments and anomalies, each with its name."""
+        from oodd_eval.data.offers import with_intermittent  # noqa: PLC0415
+        from oodd_eval.data.registry import AnomalySpec, EnvironmentSpec  # noqa: PLC0415
 
         environments = self.listed("oodd_environments", EnvironmentSpec)
-        anomalies = self.listed("oodd_anomalies", AnomalySpec)
-        specs = [*with_intermittent([*environments, *anomalies])]
-        for spec in specs:
-            check_spec(spec)
-        return specs
+        specs = with_intermittent([*environments, *self.listed("oodd_anomalies", AnomalySpec)])
+        return [replace(spec, plugin=self.point.name) for spec in specs]
 
     def listed(self, hook: str, kind: type[_Spec]) -> list[_Spec]:
         """Return what one of its hooks offers, if these are lists of one kind."""
@@ -194,6 +189,7 @@ class Plugins:
         self._observed, self._packages = load is None, tuple(packages)
         self._offers: dict[str, Offer] = {}
         self._forms: dict[str, str] = {}
+        self._claims: dict[str, list[str]] = {}  # names of what broken plug-ins offer
         self._listener: Callable[[Broken], object] | None = None
 
     @property
@@ -208,25 +204,42 @@ class Plugins:
         return [*loaded, *self.observer_points] if self._observed else []
 
     @property
-    def custom_specs(self) -> dict[str, tuple[Spec, str]]:
-        """Environments and anomalies of plug-ins by name, with their origin; all are loaded."""
-        return self._offered(lambda plugin: plugin.custom_specs())
+    def custom_specs(self) -> OfferedSpecs:
+        """Environments and anomalies of plug-ins, and what names mean; all are loaded."""
+        from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS  # noqa: PLC0415
+        from oodd_eval.data.offers import OfferedSpecs, check_spec  # noqa: PLC0415
+
+        specs = tuple(s for s, _ in self._offered(lambda p: p.custom_specs(), check_spec))
+        broken = {
+            name: f"{b.plugin!r} of {b.distribution}: {b.reason}"
+            for b in self.broken
+            for name in (b.plugin, *self._claims.get(b.plugin, ()))
+            if name not in {*ENVIRONMENTS, *ANOMALIES}
+        }
+        return OfferedSpecs(specs, broken)
+
+    def origin(self, plugin: str) -> str:
+        """Return what messages call a loaded plug-in."""
+        return name_of(self.loaded[plugin].point)
 
     def offered_by(
-        self, hook: str, kind: type[_Spec], check: Callable[[_Spec], object]
-    ) -> dict[str, tuple[_Spec, str]]:
-        """Return what a hook of plug-ins offers by name, with its origin; all are loaded.
+        self,
+        hook: str,
+        kind: type[_Spec],
+        check: Callable[[_Spec], object],
+        taken: Collection[str] = (),
+    ) -> list[_Spec]:
+        """Return what a hook of plug-ins offers; all are loaded.
 
-        A plug-in is broken when `check` raises for something that it offers.
+        What shares its name, or has one that is `taken`, is named ``PLUGIN/NAME``. A plug-in is
+        broken when `check` raises for something that it offers.
         """
-
-        def checked(plugin: Plugin) -> list[_Spec]:
-            specs = plugin.listed(hook, kind)
-            for spec in specs:
-                check(spec)
-            return specs
-
-        return self._offered(checked)
+        offered = self._offered(lambda plugin: plugin.listed(hook, kind), check)
+        names = Counter([*taken, *(spec.name for spec, _ in offered)])
+        return [
+            replace(spec, name=f"{plugin}/{spec.name}") if names[spec.name] > 1 else spec
+            for spec, plugin in offered
+        ]
 
     @property
     def offers(self) -> dict[str, Offer]:
@@ -313,21 +326,23 @@ class Plugins:
             if self._listener:
                 self._listener(self.broken[-1])
 
-    def _offered(self, of: Callable[[Plugin], list[_Spec]]) -> dict[str, tuple[_Spec, str]]:
-        """Return what all plug-ins offer by name, with its origin; no name is offered twice."""
+    def _offered(
+        self, of: Callable[[Plugin], list[_Spec]], check: Callable[[_Spec], object]
+    ) -> list[tuple[_Spec, str]]:
+        """Return what all plug-ins offer, checked, with the name of the plug-in."""
         for point in list(self._waiting):
             self._load(point)
-        offered: dict[str, tuple[_Spec, str]] = {}
+        offered: list[tuple[_Spec, str]] = []
         for plugin in list(self.loaded.values()):
             with self.blaming(plugin.point):
-                of_plugin: dict[str, tuple[_Spec, str]] = {}
-                for spec in of(plugin):
-                    name = spec.name
-                    if previous := offered.get(name) or of_plugin.get(name):
-                        by = f"{previous[1]} and by {name_of(plugin.point)}"
-                        raise PluginError(f"{name!r} is offered twice, by {by}")
-                    of_plugin[name] = (spec, name_of(plugin.point))
-                offered |= of_plugin
+                specs = of(plugin)
+                names = self._claims[plugin.point.name] = [spec.name for spec in specs]
+                for i, spec in enumerate(specs):
+                    check(spec)
+                    if spec.name in names[:i]:
+                        raise PluginError(f"{spec.name!r} is offered twice by {plugin}")
+                offered += [(spec, plugin.point.name) for spec in specs]
+                del self._claims[plugin.point.name]
         return offered
 
     def _load(self, point: EntryPoint) -> None:

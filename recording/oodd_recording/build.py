@@ -31,7 +31,14 @@ from oodd_eval.data.facts import ENVIRONMENTS, PART_OFFSETS, SplitDefinition, in
 from oodd_eval.data.files import only_writer, remove_abandoned, replacing
 from oodd_eval.data.layout import Blocks
 from oodd_eval.data.parts import CALIBRATION, TRAIN, TWINS, EnvironmentData
-from oodd_eval.data.registry import Spec, anomaly_spec, register, registered
+from oodd_eval.data.registry import (
+    Spec,
+    anomaly_spec,
+    environment_spec,
+    long_name,
+    register,
+    registered,
+)
 from oodd_eval.data.split import Split, load_split
 from oodd_eval.errors import MissingExtraError, SimulationError, SplitError, UsageError
 from oodd_eval.names import check_known
@@ -194,6 +201,8 @@ def _write(
     conditions = [condition for condition, _ in chunks[-1].conditions]
     info = info_of(environment)
     kinds = {c.anomaly: anomaly_spec(c.anomaly).group for c in conditions}
+    specs = {"": environment_spec(environment)} | {kind: anomaly_spec(kind) for kind in kinds}
+    plugins = {name: spec.plugin for name, spec in specs.items() if spec.plugin}
     files = {p: [work / c.file_name for c in chunks if c.part == p] for p in PART_OFFSETS}
     with contextlib.ExitStack() as stack:
         taken: dict[str, layout.Arrays] = {}
@@ -216,7 +225,8 @@ def _write(
             actions=info.actions,
             custom=layout.own_facts(
                 environment, discrete=info.discrete, groups=kinds, sensors=info.sensors
-            ),
+            )
+            | ({"plugins": plugins} if plugins else {}),
         ) | _strengths(definition, environment)
 
 
@@ -274,12 +284,24 @@ def _kept(definition: SplitDefinition, directory: Path, digests: dict[str, str])
             f"{directory} holds the split {manifest['definition']}, expected {recipe}: "
             "choose another name or remove it"
         )
+    kinds = {c.anomaly for e in digests for c in _conditions(definition, e)}
     for environment in split.environments:
-        entry = manifest["environments"][environment]
-        same_policy = digests.get(environment, entry["policy"]) == entry["policy"]
-        numbers = _strengths(definition, environment).get("strengths")
-        same = numbers is None or entry.get("strengths", numbers) == numbers
-        if manifest["generator"] == GENERATOR_VERSION and same_policy and same:
+        entry, same = manifest["environments"][environment], True
+        held = kinds & layout.groups_of(entry).keys()
+        specs: list[tuple[str, Spec]] = [(kind, anomaly_spec(kind)) for kind in held]
+        if environment in digests:
+            specs += [("", environment_spec(environment))]
+            numbers = _strengths(definition, environment).get("strengths")
+            same = numbers is None or entry.get("strengths", numbers) == numbers
+            same = same and digests[environment] == entry["policy"]
+        for kind, spec in specs:
+            name = split.long_name(environment, kind)
+            if "/" in name and long_name(spec) not in {name, spec.name}:
+                raise UsageError(
+                    f"{directory} holds {name}, and {long_name(spec)} has the same short name, by "
+                    "which a split knows it: choose another name for the split"
+                )
+        if manifest["generator"] == GENERATOR_VERSION and same:
             with contextlib.suppress(SplitError):  # a damaged file is built again
                 split.environment(environment).close()
                 kept[environment] = entry

@@ -6,6 +6,7 @@ The evaluator knows them by name only (`oodd_eval.cli.main`).
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Final
@@ -30,14 +31,29 @@ from oodd_eval.cli import (
     say,
 )
 from oodd_eval.cli.console import make_console
-from oodd_eval.cli.plugins import register_custom
+from oodd_eval.cli.plugins import discovered
 from oodd_eval.data.condition import Condition
-from oodd_eval.data.facts import ANOMALIES, CUSTOM_SEED_BASES, ENVIRONMENTS, SPLITS, SplitDefinition
+from oodd_eval.data.facts import (
+    CUSTOM_SEED_BASES,
+    ENVIRONMENTS,
+    LONG_NAMES,
+    SPLITS,
+    SplitDefinition,
+)
 from oodd_eval.data.files import temporary_directory
-from oodd_eval.data.registry import AnomalySpec, EnvironmentSpec, inner_of
+from oodd_eval.data.offers import OfferedSpecs
+from oodd_eval.data.registry import (
+    AnomalySpec,
+    EnvironmentSpec,
+    Spec,
+    environment_spec,
+    long_name,
+    registered,
+    short_name,
+)
 from oodd_eval.data.split import data_home, load_split
 from oodd_eval.errors import UsageError
-from oodd_eval.names import Predicate, assignment, counted, select
+from oodd_eval.names import Predicate, assignment, check_known, counted, select
 from oodd_eval.scoring.display import SILENCE, Pace
 from oodd_recording.build import Progress, build_split
 from oodd_recording.calibrate import calibrate as find_strengths
@@ -118,9 +134,16 @@ def build(options: Options) -> int:
     definition = _definition(options)
     environments = list(definition.environments or ENVIRONMENTS)
     if options.env != "all" or options.strength or definition.environments:
-        custom = [s.name for s in register_custom(options) if isinstance(s, EnvironmentSpec)]
+        offered = discovered(options).custom_specs
         if options.env != "all":
-            environments = select("environment", options.env, [*ENVIRONMENTS, *custom])
+            environments = offered.select_environments(options.env)
+        # What a published definition names is the project's, whatever else is installed.
+        long = LONG_NAMES if definition.environments else {}
+        environments = [long.get(name, name) for name in environments]
+        kinds = [Condition.parse(name).anomaly for name in definition.strengths]
+        environments = offered.register(environments, kinds)
+        strengths = {short_name(name): number for name, number in definition.strengths.items()}
+        definition = replace(definition, strengths=strengths)
     if options.policy and len(environments) != 1:
         raise UsageError(f"--policy is for one --env, got {', '.join(environments)}")
     policies = dict.fromkeys(environments, options.policy) if options.policy else {}
@@ -245,14 +268,14 @@ def calibrate(options: Options) -> int:
 
     With --env, also in environments of plug-ins, and of kinds of theirs.
     """
-    specs = register_custom(options) if options.env != "all" else []
-    custom = [spec.name for spec in specs if isinstance(spec, EnvironmentSpec)]
-    kinds = [spec.name for spec in specs if isinstance(spec, AnomalySpec)]
-    environments = list(ENVIRONMENTS)
+    environments, kinds = list(ENVIRONMENTS), options.anomaly.split(",")
     if options.env != "all":
-        environments = select("environment", options.env, [*ENVIRONMENTS, *custom])
+        offered = discovered(options).custom_specs
+        environments = offered.select_environments(options.env)
+        environments = offered.register(environments, [] if kinds == ["all"] else kinds)
+    known = [spec.name for spec in registered() if isinstance(spec, AnomalySpec)]
     work = options.work or options.output.with_name(options.output.name + ".work")
-    selected = select("anomaly", options.anomaly, [*ANOMALIES, *kinds])
+    selected = select("anomaly", ",".join(map(short_name, kinds)), known)
     with _shown("evaluations", quiet=options.verbosity < 0) as progress:
         strengths = find_strengths(
             options.output,
@@ -286,10 +309,10 @@ def page(options: Options) -> int:
     It has what the plug-in says of the environment, sensors, actions, kinds of anomalies with their
     strengths, a frame or drawing, and for each kind an episode beside its twin.
     """
-    _must_know(options)
-    environment, kinds = options.environment, []
-    if options.anomaly:
-        kinds = select("anomaly", options.anomaly, kinds_of(environment))
+    kinds = options.anomaly.split(",") if options.anomaly else []
+    environment = _meant(options, kinds)
+    if kinds:
+        kinds = select("anomaly", ",".join(map(short_name, kinds)), kinds_of(environment))
     notes = make_console(quiet=options.verbosity < 0)
     path = write_page(Page(environment, kinds), options.output, notes.print)
     make_console().print(f"page of {environment}: {path}")
@@ -305,14 +328,10 @@ def page(options: Options) -> int:
 @click.option("--seed", type=int, default=1, help="seed of the training")
 def train(options: Options) -> int:
     """Train a policy, going on from a checkpoint if there is one."""
-    _must_know(options)
+    environment = _meant(options)
     tell = make_console(quiet=options.verbosity < 0).print
     best = train_policy(
-        options.environment,
-        out=options.output,
-        steps=options.steps,
-        seed=options.seed,
-        progress=tell,
+        environment, out=options.output, steps=options.steps, seed=options.seed, progress=tell
     )
     make_console().print(f"best policy in {best}")
     return 0
@@ -332,7 +351,7 @@ def import_policy(options: Options) -> int:
     from oodd_recording.onnx_files import layers_of, write_policy  # noqa: PLC0415  of an extra
 
     options.environment = options.env
-    _must_know(options)
+    environment = _meant(options)
     arrays = layers_of(options.path, options.tensor)
     suffix = ".onnx" if arrays is None else ".npz"
     if options.output.suffix != suffix:
@@ -343,13 +362,13 @@ def import_policy(options: Options) -> int:
     with temporary_directory() as directory:  # a policy that cannot act is not written
         partial = directory / options.output.name
         write_policy(options.path, options.tensor, arrays, partial)
-        returns = evaluate_policy(options.env, load_policy(options.env, partial), episodes=TRIED)
+        returns = evaluate_policy(environment, load_policy(environment, partial), episodes=TRIED)
     write_policy(options.path, options.tensor, arrays, options.output)
-    policy = load_policy(options.env, options.output)
+    policy = load_policy(environment, options.output)
     steps = "onnxruntime" if arrays is None else counted(len(arrays["steps"]), "operation(s)")
     make_console().print(
         f"policy in {options.output}, {steps}, digest {policy.digest[:12]}: mean return "
-        f"{returns.mean():.1f} in {TRIED} episodes of {options.env}"
+        f"{returns.mean():.1f} in {TRIED} episodes of {environment}"
     )
     return 0
 
@@ -367,8 +386,7 @@ def import_policy(options: Options) -> int:
 )
 def evaluate(options: Options) -> int:
     """Print the mean return of a policy over fresh nominal episodes."""
-    name = options.environment
-    _must_know(options)
+    name = _meant(options)
     returns = evaluate_policy(
         name, load_policy(name, options.policy), episodes=options.episodes, noise=options.noise
     )
@@ -380,31 +398,31 @@ def evaluate(options: Options) -> int:
     return 0
 
 
-def _must_know(options: Options) -> None:
-    """Ask plug-ins for an environment that the benchmark does not have."""
-    if options.environment not in ENVIRONMENTS:
-        register_custom(options)
+def _meant(options: Options, kinds: Sequence[str] = ()) -> str:
+    """Register what the name of an environment means, and those of kinds; return its short name."""
+    name: str = options.environment
+    if name not in ENVIRONMENTS:
+        discovered(options).custom_specs.register([name], kinds)
+    return short_name(name)
 
 
-def _package_of(spec: AnomalySpec | EnvironmentSpec) -> str:
-    return inner_of(spec.make).__module__.partition(".")[0]
-
-
-def check_custom(options: Options, selects: Predicate) -> int:
+def check_custom(options: Options, selects: Predicate, spec: Spec, offered: OfferedSpecs) -> int:
     """Check an environment or an anomaly of a plug-in; 1 when a check failed, 5 when none ran."""
-    specs = {spec.name: spec for spec in register_custom(options)}
-    spec, environment = specs[options.name], options.name
-    if isinstance(spec, AnomalySpec):
-        beside = (
-            s.name
-            for s in specs.values()
-            if isinstance(s, EnvironmentSpec) and _package_of(s) == _package_of(spec)
-        )
-        environment = options.env or next(iter([*spec.environments, *beside, "cartpole"]))
-    else:
-        refuse(options, ["env"], f"is for anomalies, and {spec.name} is an environment")
+    name, environment, beside = long_name(spec), options.env, spec.plugin
+    if isinstance(spec, EnvironmentSpec):
+        refuse(options, ["env"], f"is for anomalies, and {name} is an environment")
+        environment = name
+    elif not environment:
+        environments = [s for s in offered.specs if isinstance(s, EnvironmentSpec)]
+        of_plugin = [s.name for s in environments if s.plugin == beside]
+        environment = [*spec.environments, *of_plugin, "cartpole"][0]
+    kinds = [name] if isinstance(spec, AnomalySpec) else []
+    (environment,) = offered.register([environment], kinds, "" if options.env else beside)
+    if kinds:
+        check_known(f"anomaly that {environment} can have", kinds_of(environment), spec.name)
+        name = f"{name} in {long_name(environment_spec(environment))}"
     console, results = make_console(), []
-    console.print(f"{spec.name} in {environment}" if spec.name != environment else spec.name)
+    console.print(name)
     for name, check in custom_checks(spec, environment):
         if selects(name):
             start = time.perf_counter()

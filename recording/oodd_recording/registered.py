@@ -18,6 +18,7 @@ from oodd_eval.data.registry import (
     file_of,
     functions_of,
     inner_of,
+    long_name,
     registered,
 )
 from oodd_eval.errors import UsageError
@@ -55,11 +56,12 @@ def info_of(environment: str) -> EnvironmentInfo:
 def kinds_of(environment: str) -> list[str]:
     """Return the kinds of anomalies that can be recorded in an environment at any strength."""
     discrete, attributes = info_of(environment).discrete, environment_spec(environment).attributes
+    names = {environment, long_name(environment_spec(environment))}
     kinds = [
         spec.name
         for spec in registered()
         if isinstance(spec, AnomalySpec)
-        and environment in (spec.environments or [environment])
+        and (not spec.environments or names & {*spec.environments})
         and {*spec.needs, *(spec.needs_discrete if discrete else ())} <= attributes.keys()
     ]
     return in_order(kinds, ANOMALIES)

@@ -66,9 +66,10 @@ def test_oodd_detectors(monkeypatch, tmp_path):
 
 def test_oodd_environments_and_anomalies(monkeypatch, tmp_path):
     install(monkeypatch, tmp_path, "basin", BASIN, header="")
-    specs = discover(only=["basin"]).custom_specs
-    (valve, origin), (seep, _) = specs["valve"], specs["seep"]
-    assert origin == "plug-in 'basin' of oodd-basin"
+    plugins = discover(only=["basin"])
+    specs = plugins.custom_specs
+    (valve,), (seep,) = specs.meanings("basin/valve"), specs.meanings("seep")
+    assert plugins.origin(valve.plugin) == "plug-in 'basin' of oodd-basin"
     assert [quantity.name for quantity in valve.actions] == ["close", "open"]
     assert (seep.group, seep.bound) == ("dynamics", 3.0)
 

@@ -16,6 +16,8 @@ from oodd_worlds.acts import ACTS as WORLDS
 
 from oodd_eval import Trajectory, intervene
 from oodd_eval.data.facts import SplitDefinition
+from oodd_eval.data.offers import OfferedSpecs
+from oodd_eval.data.registry import EnvironmentSpec
 from oodd_eval.errors import SimulationError, UnknownNameError, UsageError
 from oodd_eval.scoring.plan import source_digest
 
@@ -255,8 +257,37 @@ def test_an_act_of_the_environment_takes_the_place_of_a_general_one():
     general = ActSpec("stop", None, "", ("sensor", "dynamics"))
     special = ActSpec("stop", None, "", ("dynamics",), ("cartpole",))
     other = ActSpec("switch", None, "", ("dynamics",), ("hopper",))
-    acts = [special, general, other]
-    assert suiting(acts, ["stop", "switch"], "cartpole", "dynamics") == (special,)
-    assert suiting(acts, ["stop", "switch"], "cartpole", "sensor") == (general,)
-    assert suiting(acts, ["switch"], "hopper", "dynamics") == (other,)
-    assert suiting(acts, ["stop"], "hopper", "dynamics") == (general,)
+    acts = [(act, "mine") for act in (special, general, other)]
+    chosen = functools.partial(suiting, acts, ["stop", "switch"], OfferedSpecs())
+    assert chosen(environment_of("cartpole"), "dynamics") == (special,)
+    assert chosen(environment_of("cartpole"), "sensor") == (general,)
+    assert chosen(environment_of("hopper"), "dynamics") == (general, other)
+
+
+def environment_of(name, plugin=""):
+    return EnvironmentSpec(name, None, None, (), (), 9, plugin=plugin)
+
+
+def test_acts_of_plugins_are_for_their_own_environments_and_clashes_break_none():
+    """Three plug-ins have a `tank` and stop it; two have a general act `pause`."""
+    plugins = ("one", "two", "worlds")
+    specs = OfferedSpecs(tuple(environment_of("tank", plugin) for plugin in plugins))
+    stops = {p: ActSpec("stop", None, p, ("dynamics",), ("tank",)) for p in plugins}
+    pauses = {p: ActSpec("pause", None, p, ("dynamics",)) for p in ("one", "two")}
+    shipped = ActSpec("mask", None, "shipped", ("dynamics",))
+    mask = ActSpec("mask", None, "one", ("dynamics",))
+    offered = [(shipped, ""), *((act, p) for p, act in stops.items()), (mask, "one")]
+    offered += [(act, p) for p, act in pauses.items()]
+
+    def chosen(names, plugin):
+        return suiting(offered, names, specs, environment_of("tank", plugin), "dynamics")
+
+    for plugin in plugins:
+        assert chosen(["stop"], plugin) == (stops[plugin],)
+    assert chosen(["worlds/stop"], "one") == ()
+    assert chosen(["stop", "pause", "mask"], "one") == (mask, stops["one"], pauses["one"])
+    assert chosen(["mask"], "two") == chosen(["mask"], "worlds") == (shipped,)
+    assert chosen(["one/mask"], "two") == (mask,)
+    assert chosen(["two/pause"], "worlds") == (pauses["two"],)
+    with pytest.raises(UsageError, match="one/pause and two/pause"):
+        chosen(["pause"], "worlds")

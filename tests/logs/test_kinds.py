@@ -226,8 +226,8 @@ def test_a_kind_of_a_plugin_is_told_drafted_and_converted(tmp_path, monkeypatch)
     assert recipe.columns == {"decibels": ("p",)}
     with read_episodes(recipe, tmp_path) as source:
         assert min(e.observations[:, 0].min() for e in source.episodes("train")) > 0
-    with pytest.raises(PluginError, match="angle"):
-        kinds.check_kind(Kind("angle", ""))
+    with pytest.raises(PluginError, match="An angle"):
+        kinds.check_kind(Kind("An angle", ""))
 
 
 def spoilt(folder, columns, number=3):

@@ -32,7 +32,13 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import oodd_eval
 from oodd_eval.cli.main import main
-from oodd_eval.errors import MissingExtraError, PluginError, TrajectoryError, UsageError
+from oodd_eval.errors import (
+    MissingExtraError,
+    PluginError,
+    TrajectoryError,
+    UnknownNameError,
+    UsageError,
+)
 from oodd_eval.plugins.discovery import discover
 
 
@@ -1289,10 +1295,26 @@ def test_a_recipe_names_the_format_of_a_plugin(monkeypatch, tmp_path, capsys):
     assert "x" in capsys.readouterr().out
 
 
-def test_a_plugin_takes_no_name_of_ours(monkeypatch, tmp_path):
-    install(monkeypatch, tmp_path, "plant", READER.replace("NAME", "csv"))
-    plugins = discover(only=["plant"])
-    assert plugins.offered_by("oodd_readers", Reader, check_reader) == {}
+def test_a_plugin_takes_no_name_of_ours_and_clashes_break_none(monkeypatch, tmp_path):
+    install(monkeypatch, tmp_path / "a", "plant", READER.replace("NAME", "csv"))
+    install(monkeypatch, tmp_path / "b", "mill", READER.replace("NAME", "csv"))
+    shop = READER.replace("NAME", "shop")
+    for name in ("one", "two"):
+        install(monkeypatch, tmp_path / name, name, shop)
+    plugins = discover(only=["plant", "mill", "one", "two"])
+    offered = plugins.offered_by("oodd_readers", Reader, check_reader, logs.shipped_readers())
+    names = ["mill/csv", "one/shop", "plant/csv", "two/shop"]
+    assert ([*plugins.broken], sorted(reader.name for reader in offered)) == ([], names)
+    monkeypatch.setattr(logs, "_registered", {})
+    register_readers(offered)
+    (tmp_path / "a.csv").write_text("x\n1\n")
+    assert logs.reader_for(tmp_path / "a.csv") is logs.shipped_readers()["csv"]
+    assert logs.reader_for(tmp_path / "a.csv", "two/shop").name == "two/shop"
+    with pytest.raises(UnknownNameError, match="one/shop"):
+        logs.reader_for(tmp_path / "a.csv", "shop")
+    install(monkeypatch, tmp_path / "c", "loom", READER.replace("NAME", "No"))
+    plugins = discover(only=["loom"])
+    assert plugins.offered_by("oodd_readers", Reader, check_reader) == []
     assert "cannot be the name of a reader" in plugins.broken[0].reason
     with pytest.raises(PluginError, match="has the suffixes"):
         register_readers([Reader("odd", "a file", ("odd",), print)])
@@ -1302,7 +1324,7 @@ def test_a_reader_in_a_further_module_is_found(tmp_path, monkeypatch):
     code = "READER = Reader('toy', 'a toy', ('.toy',), print)"
     (tmp_path / "toy.py").write_text(f"from oodd_logs.readers import Reader\n{code}\n")
     monkeypatch.setattr(logs, "__path__", [*logs.__path__, str(tmp_path)])
-    assert "toy" in logs._ours.__wrapped__()
+    assert "toy" in logs.shipped_readers.__wrapped__()
 
 
 def test_whatever_a_reader_raises_names_the_file(tmp_path, monkeypatch):

@@ -23,7 +23,8 @@ from oodd_recording.values import choose_sensors, spread_of
 from oodd_eval import AnomalySpec, EnvironmentSpec, Fault, Quantity, load_split
 from oodd_eval.cli.main import main
 from oodd_eval.data.facts import ENVIRONMENTS
-from oodd_eval.data.registry import check_spec, register, with_intermittent
+from oodd_eval.data.offers import check_spec, with_intermittent
+from oodd_eval.data.registry import register
 from oodd_eval.errors import MissingExtraError, PluginError, SimulationError, UsageError
 
 SEED = 77

@@ -20,7 +20,7 @@ BITS = 0x7E0C5A4DF6DB7DB56E4A2AB8C1E4C9A1
 
 @pytest.fixture(autouse=True, scope="module")
 def worlds():
-    register([spec for spec, _ in discover().custom_specs.values()])
+    register(discover().custom_specs.specs)
 
 
 def test_a_season_has_the_sizes_and_environments_of_all_seasons():

@@ -38,7 +38,7 @@ STYLES: Final = {
 @click.argument(
     "name",
     type=Name("detectors", "envs", "anomalies"),
-    help="a detector, or a plug-in's environment or anomaly",
+    help="a detector, or a plug-in's environment or anomaly, as PLUGIN/NAME where several have it",
 )
 @click.option(
     "--env", type=Name("envs"), help="where to try an anomaly (default: one that it is for)"
@@ -51,7 +51,7 @@ STYLES: Final = {
 def check(options: Options) -> int:
     """Check that a detector honours the contract, or an environment or anomaly of a plug-in.
 
-    The exit code is 1 when a check failed, and 5 when none ran.
+    The exit code is 1 when a check failed or a plug-in is broken, and 5 when none ran.
     """
     from oodd_checks.testing import CHECKS, supervise
 
@@ -62,10 +62,12 @@ def check(options: Options) -> int:
     try:
         offer = plugins.offer(options.name)
     except UnknownNameError:
-        if options.name in plugins.custom_specs:
-            refuse(options, _OF_DETECTORS, f"is for detectors, and {options.name} is none")
-            return int(load("oodd_recording.commands:check_custom")(options, selects))
-        raise
+        offered = plugins.custom_specs
+        if not (meanings := offered.meanings(options.name)):
+            raise
+        refuse(options, _OF_DETECTORS, f"is for detectors, and {options.name} is none")
+        check_custom = load("oodd_recording.commands:check_custom")
+        return int(check_custom(options, selects, *meanings, offered) or bool(plugins.broken))
     refuse(options, ["env"], f"is for anomalies, and {options.name} is a detector")
     parameters = parameters_by_detector([offer.spec.name], dict(options.param))[offer.spec.name]
     # The episodes of checks have actions.
@@ -95,4 +97,4 @@ def check(options: Options) -> int:
         report = CheckReport(results)
         console.print(report.summary(), style="green" if report.ok else "bold red")
         good = good and report.ok
-    return 0 if good else 1
+    return 0 if good and not plugins.broken else 1

@@ -26,8 +26,8 @@ from oodd_eval.cli import (
 )
 from oodd_eval.cli.console import make_console
 from oodd_eval.cli.plugins import discovered
+from oodd_eval.data.facts import LONG_NAMES
 from oodd_eval.data.files import only_writer
-from oodd_eval.data.registry import register
 from oodd_eval.errors import UsageError
 from oodd_eval.names import counted, select
 from oodd_eval.plugins.isolation.child import Limits
@@ -85,7 +85,7 @@ def season(options: Options) -> int:
     passed = {name: getattr(options, name) for name in SeasonSizes._fields}
     sizes = SeasonSizes(**{name: size for name, size in passed.items() if size is not None})
     plugins = discovered(options)
-    register(spec for spec, _ in plugins.custom_specs.values())
+    plugins.custom_specs.register(LONG_NAMES.get(name, name) for name in environments)
     entries = []
     if options.entries:
         if not (entries := read_entries(options.entries)):

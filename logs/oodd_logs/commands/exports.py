@@ -6,7 +6,7 @@ from oodd_eval.cli import OUTPUT_DIRECTORY, Names, Options, command
 from oodd_eval.cli.console import make_console
 from oodd_eval.cli.data import split_argument
 from oodd_eval.data.split import load_split
-from oodd_eval.names import counted, select
+from oodd_eval.names import counted
 from oodd_logs.minari_files import export as export_split
 
 
@@ -20,7 +20,7 @@ from oodd_logs.minari_files import export as export_split
 def export(options: Options) -> int:
     """Write a split in another project's format."""
     split = load_split(options.name)
-    environments = select("environment", options.env, split.environments)
+    environments = split.select_environments(options.env)
     notes = make_console(quiet=options.verbosity < 0)
     written = export_split(split, options.output, environments=environments, progress=notes.print)
     hint = f"Minari finds them with MINARI_DATASETS_PATH={options.output}"

@@ -5,6 +5,7 @@ hook ``oodd_kinds``. A kind tells by which columns it is recognised, in which wo
 says so, which line of a recipe it writes, and how it converts what it is about.
 """
 
+import dataclasses
 import functools
 import importlib
 import pkgutil
@@ -94,7 +95,7 @@ class Kind:
 
 def kinds() -> Mapping[str, Kind]:
     """Return the kinds by name: the project's, and those of plug-ins that were registered."""
-    return MappingProxyType({**_ours(), **_registered})
+    return MappingProxyType({**shipped_kinds(), **_registered})
 
 
 def kinds_by_key() -> Mapping[str, Kind]:
@@ -103,19 +104,22 @@ def kinds_by_key() -> Mapping[str, Kind]:
 
 
 def register_kinds(offered: Iterable[Kind]) -> None:
-    """Make kinds of plug-ins known in this process; `check_kind` says which may be."""
+    """Make kinds of plug-ins known in this process; `check_kind` says which may be.
+
+    Where several share a name, or it is one of the project's, it is ``PLUGIN/NAME``.
+    """
     for kind in offered:
-        check_kind(kind)
+        check_kind(dataclasses.replace(kind, name=str(kind.name).rpartition("/")[2]))
         _registered[kind.name] = kind
         _of_messages.cache_clear()
 
 
 def check_kind(kind: Kind) -> None:
-    """Raise `PluginError` for a kind with a wrong name or key, or one that the project has."""
-    if not re.fullmatch(NAME_PATTERN, str(kind.name)) or kind.name in _ours():
+    """Raise `PluginError` for a kind with a wrong name or key."""
+    if not re.fullmatch(NAME_PATTERN, str(kind.name)):
         raise PluginError(
             f"{kind.name!r} cannot be the name of a kind of columns, expected lower-case letters, "
-            f"digits and hyphens, and none of {', '.join(_ours())}"
+            "digits and hyphens"
         )
     if kind.key and (kind.check is None or kind.convert is None):
         raise PluginError(f"kind {kind.name!r} has the key {kind.key!r}, but no check and convert")
@@ -139,7 +143,8 @@ def read_texts(texts: Sequence[str]) -> dict[str, float]:
 
 
 @functools.cache
-def _ours() -> dict[str, Kind]:
+def shipped_kinds() -> dict[str, Kind]:
+    """Return the kinds of the project by name."""
     names = (module.name for module in pkgutil.iter_modules(__path__, f"{__name__}."))
     modules = map(importlib.import_module, names)
     return {module.KIND.name: module.KIND for module in modules if hasattr(module, "KIND")}

@@ -137,7 +137,7 @@ class Reader:
 
 def readers() -> Mapping[str, Reader]:
     """Return the readers by name: the project's, and those of plug-ins that were registered."""
-    return MappingProxyType({**_ours(), **_registered})
+    return MappingProxyType({**shipped_readers(), **_registered})
 
 
 def reader_for(path: Path, form: str = "") -> Reader:
@@ -162,18 +162,21 @@ def reader_for(path: Path, form: str = "") -> Reader:
 
 
 def register_readers(offered: Iterable[Reader]) -> None:
-    """Make readers of plug-ins known in this process; `check_reader` says which may be."""
+    """Make readers of plug-ins known in this process; `check_reader` says which may be.
+
+    Where several share a name, or it is one of the project's, it is ``PLUGIN/NAME``.
+    """
     for reader in offered:
-        check_reader(reader)
+        check_reader(dataclasses.replace(reader, name=str(reader.name).rpartition("/")[2]))
         _registered[reader.name] = reader
 
 
 def check_reader(reader: Reader) -> None:
-    """Raise `PluginError` for a reader with a wrong name, or one that the project has."""
-    if not re.fullmatch(NAME_PATTERN, str(reader.name)) or reader.name in _ours():
+    """Raise `PluginError` for a reader with a wrong name, or wrong suffixes."""
+    if not re.fullmatch(NAME_PATTERN, str(reader.name)):
         raise PluginError(
             f"{reader.name!r} cannot be the name of a reader, expected lower-case letters, digits "
-            f"and hyphens, and none of {', '.join(_ours())}"
+            "and hyphens"
         )
     wrong = [s for s in reader.suffixes if s != s.lower() or not s.startswith(".")]
     if isinstance(reader.suffixes, str) or wrong or not callable(reader.open):
@@ -298,7 +301,8 @@ def _guarded(topic: Topic, recording: Recording) -> Topic:
 
 
 @functools.cache
-def _ours() -> dict[str, Reader]:
+def shipped_readers() -> dict[str, Reader]:
+    """Return the readers of the project by name."""
     modules = [
         importlib.import_module(m.name) for m in pkgutil.iter_modules(__path__, f"{__name__}.")
     ]
