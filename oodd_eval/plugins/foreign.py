@@ -10,32 +10,32 @@ _MODEL = ("fit", "predict", "forward", "learn_one")  # methods of a model, not o
 
 def refuse_foreign(detector: object) -> None:
     """Raise `UsageError` for another library's object or class, with the name to hand over."""
-    made = detector if isinstance(detector, type) else type(detector)
-    library, *modules = made.__module__.split(".")
-    name, advice = made.__name__, "hand over a class with these two methods around it"
+    model = detector if isinstance(detector, type) else type(detector)
+    library, *modules = model.__module__.split(".")
+    name, advice = model.__name__, "hand over a class with these two methods around it"
     named = library in ("sklearn", "pyod", "river")
-    if not named and (_takes_episodes(made) or not any(hasattr(made, m) for m in _MODEL)):
+    if not named and (_takes_episodes(model) or not any(hasattr(model, m) for m in _MODEL)):
         return
     names = [f"{library}:{name}"] if named else []
-    if library not in ("pyod", "river") and hasattr(made, "predict"):
+    if library not in ("pyod", "river") and hasattr(model, "predict"):
         names.append(".".join([f"forecast:{library}", *(m for m in modules if m[0] != "_"), name]))
     if offered := next(filter(_is_offered, names), ""):
         advice = f"hand over the name {offered!r}, with its parameters beside it"
     raise UsageError(
-        f"{made.__module__}.{name} does not have fit(nominal) and score(trajectory) of episodes: "
+        f"{model.__module__}.{name} does not have fit(nominal) and score(trajectory) of episodes: "
         f"{advice} (docs/adapters.md)"
     )
 
 
-def _takes_episodes(made: type) -> bool:
+def _takes_episodes(model: type) -> bool:
     """Tell whether a class has `score`, and a `fit` that needs no more than one argument."""
     try:
-        inspect.signature(made.fit).bind(None, None)  # type: ignore[attr-defined]
+        inspect.signature(model.fit).bind(None, None)  # type: ignore[attr-defined]
     except (TypeError, AttributeError):
         return False
     except ValueError:  # of some compiled functions
         pass
-    return callable(getattr(made, "score", None))
+    return callable(getattr(model, "score", None))
 
 
 def _is_offered(name: str) -> bool:

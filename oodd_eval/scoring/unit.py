@@ -105,10 +105,8 @@ class UnitJob:
         except Exception as error:
             if len({unit.setting.detector for unit in self.plan.units}) == 1:
                 raise
-            log = traceback.format_exc()
-            if isinstance(error, ContractError):
-                return Scored("invalid", str(error), log=log)
-            return Scored("error", describe(error), log=log)
+            status: Status = "invalid" if isinstance(error, ContractError) else "error"
+            return Scored(status, describe(error), log=traceback.format_exc())
 
     def _isolated(
         self,
