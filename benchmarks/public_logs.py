@@ -5,9 +5,9 @@ the files of set NAME from DIR/NAME, runs all rows, and says on the page what wa
 second call goes on where the first was interrupted. ``oodd-eval compare DIR --write-reference``
 makes of the results the records that are committed in ``leaderboard/suites/logs``.
 
-Without ``--root`` the page is filled: cards from the comments of the recipes, tables from the
-committed records where there are some, and which part of a set and which release these are of from
-``sets.toml`` beside them. With ``--check`` it is compared and not written.
+Without ``--root`` the page is filled: cards from the comments of the recipes, and which part of a
+set the committed records are of, and which release made them, from ``sets.toml`` beside them. With
+``--check`` it is compared and not written. ``docs/figures/tables.py`` fills its two tables.
 """
 
 import argparse
@@ -25,10 +25,7 @@ from oodd_logs.shipped_recipes import shipped_recipes
 
 from oodd_eval import evaluate
 from oodd_eval.errors import PromiseWarning
-from oodd_eval.results.board import boards
 from oodd_eval.results.directory import ResultsDirectory
-from oodd_eval.results.render.text import markdown_table
-from oodd_eval.results.tables import Tables
 from oodd_eval.scoring.promises import promises_of
 
 ROOT = Path(__file__).parents[1]
@@ -59,12 +56,7 @@ def card(name):
     text = re.sub(r"^# ?", "", head, flags=re.MULTILINE)
     about, hard = text.split("\nWhat is hard about it\n")
     summary, get = (" ".join(part.split()) for part in about.split("\nGet: "))
-    rows = {
-        "licence": recipe.licence,
-        "get it": get,
-        "cite": recipe.citation,
-        "recipe": f"`recipes/{name}.toml`",
-    }
+    rows = {"licence": recipe.licence, "get it": get, "cite": recipe.citation}
     return "\n\n".join(
         [
             f"## {name}",
@@ -109,22 +101,20 @@ def run(name, root, detectors, results):
     return f"{imported} `{split.digest[:12]}`.\n\n{doubts}"
 
 
-def tables_of(records):
-    """Return the tables of each set, as Markdown behind what they are of, by its name."""
+def sources(records):
+    """Return which part of each set the records are of, and where its table is, by its name."""
     sets = {Recipe.load(path).environment: name for name, path in shipped_recipes().items()}
-    pages = {}
-    for board in boards(records):
-        (environment,) = board.environments
-        name = sets[environment]
-        table = Tables(board).headline()
-        text = re.sub(r"^### (.*)", r"**\1**", markdown_table(table)).strip()
-        (digest,) = {r.split_digest for r in records if r.environment == environment}
+    digests = {sets[record.environment]: record.split_digest for record in records}
+    lines = dict.fromkeys(ORDER, "No table: its files were not at hand.")
+    for name, digest in digests.items():
         of = SETS[name]
         release = of["release"] + (f", whose recipe had {of['recipe']}" if "recipe" in of else "")
-        head = f"Computed on {of['part']}, by release {release}; digest `{digest[:12]}`."
-        pages[name] = f"{head}\n\n{text}"
-    none = "No table: its files were not at hand."
-    return {name: pages.get(name, none) for name in ORDER}
+        table = f"../leaderboard/README.md#public-logs-split-{name}-protocol-3"
+        lines[name] = (
+            f"[Table of all rows]({table}), computed on {of['part']}, by release {release}; digest "
+            f"`{digest[:12]}`."
+        )
+    return lines
 
 
 def filled(page, **blocks):
@@ -157,8 +147,8 @@ def main(arguments=None):
         imported = {n: run(n, options.root / n, detectors, options.results) for n in present}
         page = filled(before, imported=imported)
     else:
-        tables = tables_of(ResultsDirectory(RECORDS).records()) if RECORDS.is_dir() else {}
-        page = filled(before, card={n: card(n) for n in names}, table=tables)
+        of = sources(ResultsDirectory(RECORDS).records()) if RECORDS.is_dir() else {}
+        page = filled(before, card={n: card(n) for n in names}, source=of)
     if options.check:
         return int(page != before)
     PAGE.write_text(page, encoding="utf-8")

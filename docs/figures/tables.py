@@ -55,6 +55,8 @@ from oodd_eval.results.strengths import DETECTION, Strengths
 from oodd_eval.results.tables import Tables
 
 PAGES = (README, RESULTS, *DETAILS, INTERVENTIONS, FAILURES)
+FILLED_ONLY = ROOT / "docs" / "public-logs.md"
+"""A page whose tables are filled, and whose other numbers say what files hold."""
 
 MAIN = Path(__file__).with_name("main.jsonl.xz")
 """Records of the README's main command: ``records.jsonl`` of its results."""
@@ -176,13 +178,19 @@ def logs() -> dict[str, Board]:
     return {board.environments[0]: board for board in of_splits}
 
 
-def on_logs(name: str) -> str:
-    """Return a detector's means over sets of logs of the metric by which they rank."""
-    entry, rows = Setting(name), (logs()[environment] for environment in LOGS)
-    return cells(
-        100 * board.mean(entry, board.environments, board.anomalies, board.ranking).value
-        for board in rows
-    )
+def on_logs(metric: str = "", sets: Iterable[str] = LOGS) -> Row:
+    """Return a detector's means over sets of logs of a metric, by default that by which they rank.
+
+    A dash stands where the detector was not run.
+    """
+
+    def value(board: Board, entry: Setting) -> str:
+        if entry not in board.entries:
+            return "–"  # noqa: RUF001  an en dash
+        over = board.environments, board.anomalies
+        return f"{100 * board.mean(entry, *over, metric or board.ranking).value:.1f}"
+
+    return lambda name: " | ".join(value(logs()[of], Setting(name)) for of in sets)
 
 
 @functools.cache
@@ -276,14 +284,13 @@ TABLES: dict[str, Row] = {
     "ladder oracles": by_rung,
     "worlds": in_worlds,
     "claims": verdicts,
-    "logs": on_logs,
+    "logs": on_logs(),
+    "logs false": on_logs("false_episodes_at_10pct", [*LOGS, "g1"]),
     "mask": of_study("Return saved by mask"),
     "mask costs": of_study("What mask prevents"),
-    "mask harmless": of_study("Faults that mask cannot mend"),
     "stop": of_study("Return saved by stop"),
     "stop costs": of_study("What stop prevents"),
     "switch": of_study("Return saved by switch"),
-    "switch costs": of_study("What switch prevents"),
     "stop harmless": of_study("Faults that stop cannot mend"),
     "namings": of_study("Parts named"),
     "outcomes within": within_tasks,
@@ -319,7 +326,7 @@ def problems(pages: dict[Path, str]) -> Iterator[str]:
     Parameters
     ----------
     pages
-        The Markdown of `PAGES` by path.
+        The Markdown of `PAGES` and of `FILLED_ONLY` by path.
     """
     for path, text in pages.items():
         if filled(text) != text:
@@ -327,7 +334,7 @@ def problems(pages: dict[Path, str]) -> Iterator[str]:
     for name in TABLES:
         if not any(f"<!-- table: {name} -->\n|" in text for text in pages.values()):
             yield f"no page has the table {name}"
-    yield from sentences.problems(pages.values())
+    yield from sentences.problems(pages[path] for path in PAGES)
     yield from in_output(pages[README])
     yield from of_suites()
     yield from of_leaderboard()
@@ -406,7 +413,7 @@ def unlike(fresh: str, committed: str) -> Iterator[str]:
 
 def main(arguments: list[str]) -> int:
     """Fill the pages, or with ``--check`` print what is wrong in the documents."""
-    pages = {path: path.read_text(encoding="utf-8") for path in PAGES}
+    pages = {path: path.read_text(encoding="utf-8") for path in (*PAGES, FILLED_ONLY)}
     if arguments == ["--check"]:
         lines = [*problems(pages)]
         print("\n".join(lines) or "numbers of the documents are those of what is committed")
