@@ -87,11 +87,17 @@ class Strengths:
         return UNITS[1] if any(name in GROWTH for name in self.names) else UNITS[0]
 
     def unit(self, pair: Pair) -> float:
-        """Return the strength of a pair that is 1 where several pairs are put together."""
-        if not self.calibrated:
-            return 1.0
-        rungs = {**_calibrated(*pair), **self.rungs[pair]}
-        return next((rungs[name].strength for name in UNITS if name in rungs), 1.0)
+        """Return the strength of a pair that is 1 where several pairs are put together.
+
+        NaN where there is none: strengths of different kinds then have no common scale.
+        """
+        rungs = {**_calibrated(*pair), **self.rungs[pair]} if self.calibrated else {}
+        return next((rungs[name].strength for name in UNITS if name in rungs), math.nan)
+
+    @property
+    def scaled(self) -> bool:
+        """Whether the strengths of all pairs have a common scale, that of `unit`."""
+        return not any(math.isnan(self.unit(pair)) for pair in self.rungs)
 
     def chosen(self, name: str) -> dict[Pair, str]:
         """Return the strength of each pair that counts in the column of a name.
@@ -200,7 +206,7 @@ def threshold_rows(records: Sequence[Record]) -> list[dict[str, Any]]:
             "high": threshold.interval[1],
             "weakest": threshold.weakest,
             "strongest": threshold.strongest,
-            UNITS[0]: strengths.unit(pair) if strengths.calibrated else math.nan,
+            UNITS[0]: strengths.unit(pair),
         }
         for setting, pairs in thresholds(records).items()
         for pair, threshold in pairs.items()
@@ -210,8 +216,9 @@ def threshold_rows(records: Sequence[Record]) -> list[dict[str, Any]]:
 class Point(NamedTuple):
     """One strength of a curve, as means over pairs.
 
-    `strength` is the geometric mean in the units of `Strengths.unit`, `lost` the share of the
-    return that the strength costs, NaN where that is not known.
+    `strength` is the geometric mean in the units of `Strengths.unit`, or, of one kind without a
+    common scale, in its own. `lost` is the share of the return that the strength costs, NaN where
+    that is not known.
     """
 
     strength: float
@@ -221,6 +228,8 @@ class Point(NamedTuple):
 
 def curve(records: Sequence[Record], metric: str) -> list[Point]:
     """Return a metric of one row along the strengths, the weakest first.
+
+    There is no point where strengths of several kinds have no common scale.
 
     Parameters
     ----------
@@ -233,15 +242,16 @@ def curve(records: Sequence[Record], metric: str) -> list[Point]:
     for name in strengths.names:
         cells = [r for r in strengths.at(records, name) if r.ok]
         rungs = {_pair(r): strengths.rungs[_pair(r)][r.strength] for r in cells}
+        one_kind = len({kind for _, kind in rungs}) == 1
         logs = [
-            math.log(rung.strength / strengths.unit(pair))
+            math.log(rung.strength / (strengths.unit(pair) if strengths.scaled else 1))
             for pair, rung in rungs.items()
-            if rung.strength > 0
+            if rung.strength > 0 and (strengths.scaled or one_kind)
         ]
         lost = nan_mean(1 - rung.kept for rung in rungs.values())
         value = mean_over_cells((r.seed, r.value(metric)) for r in cells)
         points.append(Point(math.exp(nan_mean(logs)), lost, value))
-    return sorted(point for point in points if not math.isnan(point.value))
+    return sorted(p for p in points if not math.isnan(p.value) and not math.isnan(p.strength))
 
 
 def _pair(record: Record) -> Pair:
@@ -255,6 +265,10 @@ _RULE: Final = (
     "The threshold is the weakest strength that a detector finds within 100 rows in half of the "
     "episodes, where at most 5 % of nominal episodes have an alarm."
 )
+_FOUND: Final = (
+    "Found is an episode with an alarm within 100 rows, where at most 5 % of nominal ones have one."
+)
+_BEYOND: Final = "≤ and > mark thresholds beyond the weakest and the strongest rung."
 _SIDES: Final = (
     "What that hides is marked: the true mean is at most this (≤), more (>), or either (~)."
 )
@@ -266,6 +280,9 @@ _COLUMNS: Final = {
     "": "Columns are named by strengths; their means are over the environments and anomalies "
     "that have the strength.",
 }  # by the unit of the strengths
+_APART: Final = (
+    "Columns are named by anomaly and strength; their means are over the environments that have it."
+)
 COSTS: Final = MappingProxyType(
     {UNITS[0]: "costs 1 % of the return", UNITS[1]: "raises the task's loss by 1 %"}
 )
@@ -316,7 +333,9 @@ class StrengthTables:
         tables = [self.separability(order)] if ranked else []
         if any(by_row.values()):  # else no level of 5 %, with few calibration episodes
             single = [self.by_place(e, by_row[e]) for e in order if places and by_row[e]]
-            tables = [self.relative(order), *tables, self.by_kind(order), *single]
+            over_all, by_kind = [self.relative(order), *tables], self.by_kind(order)
+            tables = [*over_all, by_kind] if self._unit_of_mean else [by_kind, *over_all]
+            tables += single
         return tables if whole else tables[:1]
 
     def by_place(self, entry: Setting, by_pair: Mapping[Pair, DetectionThreshold]) -> Table:
@@ -334,63 +353,81 @@ class StrengthTables:
             for e in self.board.environments
         ]
         title = f"{entry}: detection thresholds by anomaly, each in its own unit"
-        note = f"{_RULE} ≤ and > mark thresholds beyond the weakest and the strongest rung."
-        return Table(title, ["Environment", *map(self._with_unit, kinds)], rows, note=note)
+        header = ["Environment", *map(self._with_unit, kinds)]
+        return Table(title, header, rows, note=f"{_RULE} {_BEYOND}")
+
+    @property
+    def _unit_of_mean(self) -> str:
+        """Say in what thresholds of several kinds have a mean; empty where they have none."""
+        if self.by_row.get(REFERENCE):
+            return f"as a multiple of {REFERENCE}'s"
+        if self.strengths.scaled:
+            return f"as a multiple of the strength that {COSTS[self.strengths.base]}"
+        return ""
 
     def relative(self, order: Sequence[Setting]) -> Table:
-        """Return relative thresholds and shares found by strength."""
-        strengths, reference = self.strengths, self.by_row.get(REFERENCE, {})
-        means = {e: _mean(by_pair, reference, strengths) for e, by_pair in self.by_row.items()}
-        most = max((mean.pairs for mean in means.values() if mean), default=0)
-        shares = self._by_strength(order, DETECTION)
-        rows = []
-        for entry in order:
-            figures: tuple[object, ...] = (UNDEFINED, 0, "", "")
-            if mean := means[entry]:
-                text = mean.text() + "*" * (mean.pairs < most)
-                figures = text, mean.pairs, mean.below, mean.above
-            rows.append([str(entry), *map(str, figures), *shares[entry]])
-        over = "in the units of the anomalies"
-        if strengths.calibrated:
-            over = f"as a multiple of the strength that {COSTS[strengths.base]}"
-        if reference:
-            over = f"as a multiple of {REFERENCE}'s"
-        header = ["detector", "threshold", "pairs", "below", "above", *strengths.names]
-        note = (
-            f"{_RULE} Shown is its geometric mean {over}, over pairs of environment and anomaly, "
-            "with its 95 % interval. In so many pairs it lies below or above the ladder, and "
-            f"counts as the end of the ladder. {_SIDES} {_COLUMNS[strengths.base]} "
-            f"{unranked(self.board)}"
-        ).rstrip()
-        title = "Detection thresholds, lower is better, and share of episodes found by strength (%)"
-        return Table(title, header, rows, note=note)
+        """Return shares found by strength, and relative thresholds where these have a mean."""
+        reference, unit = self.by_row.get(REFERENCE, {}), self._unit_of_mean
+        names, shares = self._by_strength(order, DETECTION)
+        title, header = "share of episodes found by strength (%)", ["detector", *names]
+        rows, note = [[str(entry), *shares[entry]] for entry in order], _FOUND
+        if unit:
+            means = {
+                e: _mean(by_pair, reference, self.strengths) for e, by_pair in self.by_row.items()
+            }
+            most = max((mean.pairs for mean in means.values() if mean), default=0)
+            for row, mean in zip(rows, map(means.get, order), strict=True):
+                figures: tuple[object, ...] = (UNDEFINED, 0, "", "")
+                if mean:
+                    text = mean.text() + "*" * (mean.pairs < most)
+                    figures = text, mean.pairs, mean.below, mean.above
+                row[1:1] = map(str, figures)
+            header[1:1] = ["threshold", "pairs", "below", "above"]
+            title = f"Detection thresholds, lower is better, and {title}"
+            note = (
+                f"{_RULE} Shown is its geometric mean {unit}, over pairs of environment and "
+                "anomaly, with its 95 % interval. In so many pairs it lies below or above the "
+                f"ladder, and counts as the end of the ladder. {_SIDES}"
+            )
+        note = f"{note} {self._columns_note} {unranked(self.board)}".rstrip()
+        return Table(title[0].upper() + title[1:], header, rows, note=note)
 
     def separability(self, order: Sequence[Setting]) -> Table:
         """Return the metric that ranks by strength."""
-        texts = self._by_strength(order, self.board.ranking)
+        names, texts = self._by_strength(order, self.board.ranking)
         title = metric_info(self.board.ranking).title
         rows = [[marked(self.board, e), *texts[e]] for e in order]
-        header, note = ["detector", *self.strengths.names], _COLUMNS[self.strengths.base]
-        return Table(f"{title[0].upper()}{title[1:]} (%) by strength", header, rows, note=note)
+        title = f"{title[0].upper()}{title[1:]} (%) by strength"
+        return Table(title, ["detector", *names], rows, note=self._columns_note)
 
     def by_kind(self, order: Sequence[Setting]) -> Table:
-        """Return thresholds by kind of anomaly, means over environments."""
-        kinds = self._kinds(pair for by_pair in self.by_row.values() for pair in by_pair)
+        """Return thresholds by kind of anomaly, means over environments with a common scale."""
+        columns: dict[str, list[Pair]] = {}
+        pairs = list(dict.fromkeys(pair for by_pair in self.by_row.values() for pair in by_pair))
+        scaled = self.strengths.scaled
+        for kind in self._kinds(pairs):
+            of_kind = [pair for pair in pairs if pair[1] == kind]
+            if scaled or kind in self.units or len(of_kind) == 1:
+                columns[kind if scaled else self._with_unit(kind)] = of_kind
+            else:  # the unit may differ from environment to environment
+                columns |= {f"{kind}, {title_of(pair[0])}": [pair] for pair in of_kind}
         rows = []
         for entry in order:
-            of_kind = ({p: t for p, t in self.by_row[entry].items() if p[1] == k} for k in kinds)
-            means = (_mean(by_pair, {}, self.strengths) for by_pair in of_kind)
+            own = self.by_row[entry]
+            of_columns = ({p: own[p] for p in column if p in own} for column in columns.values())
+            means = (_mean(by_pair, {}, self.strengths) for by_pair in of_columns)
             texts = (mean.text(interval=self.intervals) if mean else "" for mean in means)
             rows.append([str(entry), *texts])
-        over, titles = "each in its own unit", [*map(self._with_unit, kinds)]
-        if self.strengths.calibrated:  # thresholds are multiples of the strength that is the unit
-            over, titles = f"in units of the strength that {COSTS[self.strengths.base]}", kinds
-        note = (
-            f"{_RULE} Means are geometric, over environments; a threshold beyond the ladder counts "
-            f"as its end. {_SIDES}"
-        )
+        over, note = "each in its own unit", _BEYOND
+        if scaled:  # thresholds are multiples of the strength that is the unit
+            over = f"in units of the strength that {COSTS[self.strengths.base]}"
+        if scaled or any(len(column) > 1 for column in columns.values()):
+            note = (
+                "Means are geometric, over environments; a threshold beyond the ladder counts "
+                f"as its end. {_SIDES}"
+            )
         title = f"Detection thresholds by anomaly, {over}"
-        return Table(title, ["detector", *titles], rows, note=note)
+        return Table(title, ["detector", *columns], rows, note=f"{_RULE} {note}")
 
     def _kinds(self, pairs: Iterable[Pair]) -> list[str]:
         kinds = {kind for _, kind in pairs}
@@ -399,11 +436,31 @@ class StrengthTables:
     def _with_unit(self, kind: str) -> str:
         return f"{kind} ({self.units[kind]})" if kind in self.units else kind
 
-    def _by_strength(self, entries: Iterable[Setting], metric: str) -> dict[Setting, list[str]]:
-        """Return a metric's means at each strength as texts."""
-        records, names = self.board.records, self.strengths.names
-        steps = [Board(self.strengths.at(records, name)) for name in names]
-        return {
+    @property
+    def _apart(self) -> bool:
+        """Whether a strength of one kind says nothing of the same number of another."""
+        kinds = {kind for _, kind in self.strengths.rungs}
+        return not self.strengths.calibrated and len(kinds) > 1
+
+    @property
+    def _columns_note(self) -> str:
+        return _APART if self._apart else _COLUMNS[self.strengths.base]
+
+    def _by_strength(
+        self, entries: Iterable[Setting], metric: str
+    ) -> tuple[list[str], dict[Setting, list[str]]]:
+        """Return names of columns, and a metric's means at each strength as texts."""
+        records, strengths = self.board.records, self.strengths
+        columns = {name: strengths.at(records, name) for name in strengths.names}
+        if self._apart:
+            columns = {
+                f"{kind} {name}": of_kind
+                for kind in self._kinds(strengths.rungs)
+                for name in strengths.names
+                if (of_kind := [r for r in columns[name] if r.anomaly == kind])
+            }
+        steps = [Board(of_column) for of_column in columns.values()]
+        return [*columns], {
             e: [show_value(board.of(e, Column(metric)), metric) for board in steps] for e in entries
         }
 
@@ -415,5 +472,6 @@ def _mean(
 ) -> MeanThreshold | None:
     """Return the mean over the pairs of a reference, or over all, in units, without one."""
     pairs = [p for p in by_pair if p in reference] if reference else [*by_pair]
-    units = [reference[p] if reference else strengths.unit(p) for p in pairs]
+    scaled = strengths.scaled
+    units = [reference[p] if reference else strengths.unit(p) if scaled else 1.0 for p in pairs]
     return geometric_mean([by_pair[p] for p in pairs], units) if pairs else None

@@ -245,11 +245,11 @@ def test_curves_are_drawn_against_strength_and_return_lost():
 GRAVITY = {"0.1": 0.1, "0.5": 0.5, "1": 1.0, "10": 10.0}
 
 
-def own(detector, shares, environment="tank", **fields):
+def own(detector, shares, environment="tank", anomaly="gravity", **fields):
     """Records at four strengths that no ladder has; a share of 4 episodes is found at each."""
     return [
         make_record(
-            detector, environment, "gravity", strength=name, magnitude=GRAVITY[name],
+            detector, environment, anomaly, strength=name, magnitude=GRAVITY[name],
             values={DETECTION: [float(i < 4 * share) for i in range(4)], NULL: [0.0] * 4,
                     "auc_matched": [0.5 + share / 2] * 4},
             **fields,
@@ -262,17 +262,67 @@ def test_strengths_of_ones_own_give_a_threshold_and_a_column_each():
     records = [*own("rf", (0.25, 0.75, 0.75, 1)), *own("pe", (0, 0, 0.5, 1))]
     values = {r["row"]: r["threshold"] for r in Results(records).thresholds()}
     assert values == {"rf": pytest.approx(math.sqrt(0.05)), "pe": pytest.approx(1)}
-    table = table_of(records, "Detection thresholds, lower")
-    assert table.header[-4:] == ["0.1", "0.5", "1", "10"]  # by number, not by text
-    assert rows_of(table)["rf"]["threshold"].startswith("0.224 [")
+    table = table_of(records, "Share of episodes found")
+    assert table.header == ["detector", "0.1", "0.5", "1", "10"]  # by number, not by text
     assert [rows_of(table)["pe"][name] for name in GRAVITY] == ["0.0", "0.0", "50.0", "100.0"]
-    assert "in the units of the anomalies" in table.note
     aucs = rows_of(table_of(records, "Matched AUC"))["rf"]
     assert [aucs[name] for name in GRAVITY] == ["62.5", "87.5", "87.5", "100.0"]
-    by_kind = table_of(records, "Detection thresholds by anomaly")
-    assert rows_of(by_kind)["pe"]["gravity"] == "1"
+    by_kind = StrengthTables(Board(records), units={"gravity": "of 1 g"}).overview()[0]
+    assert by_kind.header == ["detector", "gravity (of 1 g)"]
+    assert [row[1] for row in by_kind.rows] == ["0.224", "1"]
     assert by_kind.title.endswith("each in its own unit")
+    assert "Means" not in by_kind.note
     assert rows_of(table_of(records, "rf: detection", places=True))["tank"]["gravity"] == "0.224"
+
+
+def test_thresholds_without_a_common_scale_have_no_mean_but_relative_to_a_reference():
+    """Kilograms and newton metres; a rung alone, whose ladder is not known, is no scale either."""
+    load, stiff = (own("rf", s, anomaly=k) for k, s in (("mass", (0, 1, 1, 1)),
+                                                        ("friction", (0, 0, 1, 1))))  # fmt: skip
+    units = {"mass": "kg", "friction": "N m s/rad"}
+    tables = StrengthTables(Board([*load, *stiff]), units=units).overview()
+    assert tables[0].header == ["detector", "mass (kg)", "friction (N m s/rad)"]
+    expected = [f"{math.sqrt(a * b):.3g}" for a, b in ((0.1, 0.5), (0.5, 1))]
+    assert tables[0].rows == [["rf", *expected]]
+    shares = next(t for t in tables if t.title.startswith("Share"))
+    columns = [f"{kind} {name}" for kind in units for name in GRAVITY]
+    assert shares.header == ["detector", *columns]
+    assert shares.rows[0][1:] == [*["0.0", *["100.0"] * 3], *["0.0"] * 2, *["100.0"] * 2]
+    assert not any("threshold" in table.header for table in tables)
+    assert curve([*load, *stiff], DETECTION) == []
+    strengths = [point.strength for point in curve(load, DETECTION)]
+    assert strengths == pytest.approx([*GRAVITY.values()])
+    # A reference has the same units.
+    riqn = [dataclasses.replace(r, detector="riqn") for r in (*load, *stiff)]
+    relative = StrengthTables(Board([*load, *stiff, *riqn]), units=units).overview()[0]
+    assert "as a multiple of riqn's" in relative.note
+    assert {row[1] for row in relative.rows} == {"1 [1, 1]"}
+    # Of the benchmark's ladder each kind has the scale, of others only where they have the rung.
+    renamed = [
+        [dataclasses.replace(r, strength=name) for r, name in zip(load, names, strict=True)]
+        for names in (
+            ("kept99", "kept90", "kept75", "kept50"),
+            ("4th", "kept90", "kept75", "kept50"),
+        )
+    ]
+    for records, scaled in zip(renamed, (True, False), strict=True):
+        assert Strengths.of(records).scaled == scaled
+        first = StrengthTables(Board(records), units=units).overview()[0]
+        assert ("threshold" in first.header) == scaled
+        assert math.isnan(Results(records).thresholds()[0]["kept99"]) == (not scaled)
+
+
+def test_a_kind_has_a_mean_over_environments_where_its_unit_is_the_same():
+    records = [*own("rf", (0, 1, 1, 1)), *own("rf", (0, 0, 1, 1), environment="pool")]
+    apart, together = (
+        StrengthTables(Board(records), units=units).overview()[0]
+        for units in ({}, {"gravity": "g"})
+    )
+    assert apart.header == ["detector", "gravity, tank", "gravity, pool"]
+    assert apart.rows == [["rf", "0.224", "0.707"]]
+    assert together.header == ["detector", "gravity (g)"]
+    assert together.rows == [["rf", "0.398"]]
+    assert "Means are geometric" in together.note
 
 
 def test_the_number_of_a_record_counts_and_not_the_ladders_of_the_same_name():
