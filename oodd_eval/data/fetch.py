@@ -29,7 +29,8 @@ from oodd_eval.data.split import SHIPPED, Split, data_home
 from oodd_eval.errors import DigestError, OutputError, SplitError, SplitNotFoundError, UsageError
 
 ARCHIVES: Final = (".tar", ".tar.gz", ".tgz", ".tar.xz", ".tar.bz2", ".zip")
-ARCHIVE_BYTES: Final = 10**12
+ARCHIVE_BYTES: Final = 2 * 10**10  # packed, and unpacked: the largest published split has a third
+SPARE_BYTES: Final = 10**9  # of the disk, that stay free
 MOST_MEMBERS: Final = 10_000  # of an archive: a tar file of 10 MB may have millions
 _MIB: Final = 2**20
 
@@ -284,10 +285,14 @@ class _TarInfo(tarfile.TarInfo):
 def _members(file: str, archive: Any) -> dict[str, Callable[[], Any]]:
     """Return what opens the manifest and the files beside it; refuse an archive with tricks."""
     files: dict[PurePosixPath, Callable[[], Any]] = {}
-    zipped = isinstance(archive, zipfile.ZipFile)
+    zipped, unpacked = isinstance(archive, zipfile.ZipFile), 0
     for number, item in enumerate(archive.infolist() if zipped else archive):
         if number == MOST_MEMBERS:
             raise SplitError(f"{file} holds more than {MOST_MEMBERS} files, expected one split")
+        # To get behind a file in a tar archive takes unpacking it.
+        unpacked += item.file_size if zipped else item.size
+        if unpacked > ARCHIVE_BYTES:
+            raise SplitError(f"{file} unpacks to more than {ARCHIVE_BYTES} bytes: refused")
         if item.is_dir() if zipped else item.isdir():
             continue
         name = item.filename if zipped else item.name
@@ -366,4 +371,10 @@ def _copy(content: Any, target: Path, most: int, name: str, *, have: int = 0) ->
             if have > most:
                 target.unlink()
                 raise SplitError(f"{name} has more than the {most} bytes that it may have: refused")
+            if shutil.disk_usage(target.parent).free < len(block) + SPARE_BYTES:
+                target.unlink()
+                raise OutputError(
+                    f"{name} would leave less than {SPARE_BYTES} bytes of the disk free: make "
+                    "room, or name another disk with --output"
+                )
             out.write(block)

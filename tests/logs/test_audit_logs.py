@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from helpers_logs import write_table as write
 from oodd_logs.importing import import_data, import_recipe
+from oodd_logs.readers.cells import WIDEST
+from oodd_logs.readers.tables import table_recording
 from oodd_logs.recipe import Recipe
 
 from oodd_eval import evaluate, load_split
@@ -130,6 +132,8 @@ def paired(root, onsets, name="run.1.csv", kind="front_tyre"):
         # With dots and blanks.
         ("file, onset\nrun.1.csv, 10\n", ""),
         ("file,onset\nrun.1,10\n", ""),
+        ("file,onset\nrun.1.csv,10.0\n", ""),
+        ("file,onset\nrun.1.csv,10.5\n", "line 2"),
         ("file,onset\nrun.1.csv,10\nrun.1.csv,12\n", "twice"),
         ("file,onset\nrun.2.csv,10\n", r"run\.2\.csv"),
         ("file,onset\nrun.1.csv,soon\n", "line 2"),
@@ -282,3 +286,16 @@ def test_a_full_disk_is_told_and_nothing_is_left(tmp_path, full_disk, while_read
     assert not (output / "s.h5").exists()
     assert import_recipe(recipe, tmp_path, output).environment("s").train
     assert {path.name for path in output.iterdir()} == {"manifest.json", "s.h5"}
+
+
+def test_a_file_of_the_widest_is_read_and_a_wider_one_refused(tmp_path):
+    path = tmp_path / "wide.csv"
+    for columns in (WIDEST, WIDEST + 1):
+        path.write_text(",".join(f"c{i}" for i in range(columns)) + "\n" + "1," * columns + "1\n")
+        path.write_text(path.read_text().replace(",1\n", "\n"))
+        if columns > WIDEST:
+            with pytest.raises(TrajectoryError, match=f"{columns} columns or more, limit {WIDEST}"):
+                table_recording(path, {})
+            return
+        (topic,) = table_recording(path, {}).topics.values()
+        assert len(topic.names) == WIDEST

@@ -23,6 +23,7 @@ from oodd_logs import minari_files
 
 from oodd_eval import load_split
 from oodd_eval.cli.main import main
+from oodd_eval.data import fetch as fetching
 from oodd_eval.data.facts import ENVIRONMENTS
 from oodd_eval.data.fetch import fetch
 from oodd_eval.data.parts import parts_of
@@ -268,6 +269,45 @@ def test_an_archive_with_tricks_is_refused(tiny_split, home, tmp_path, info):
         fetch(str(archive))
     assert not list(home.iterdir())
     assert not list(tmp_path.rglob("escaped"))
+
+
+def bomb(tmp_path, name):
+    """Write an archive that announces more than an archive may have, and holds next to nothing."""
+    path = tmp_path / name
+    if path.suffix == ".zip":
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as packed:
+            packed.writestr("tiny/zeros", bytes(10**6))
+        return path
+    with tarfile.open(path, "w:gz") as packed:
+        info = tarfile.TarInfo("tiny/zeros")
+        info.size = 10**6
+        packed.addfile(info, io.BytesIO(bytes(10**6)))
+    return path
+
+
+@pytest.mark.parametrize("name", ["x.tar.gz", "x.zip"])
+def test_an_archive_that_unpacks_without_end_is_refused(home, tmp_path, monkeypatch, name):
+    monkeypatch.setattr(fetching, "ARCHIVE_BYTES", 10**6 - 1)
+    path = bomb(tmp_path, name)
+    with pytest.raises(SplitError, match=f"{name} unpacks to more than 999999 bytes: refused"):
+        fetch(str(path))
+    assert not list(home.iterdir())
+
+
+def test_a_download_without_end_is_given_up(tiny_split, home, web, monkeypatch):
+    pack(tiny_split, web.root / "tiny.tar")
+    monkeypatch.setattr(fetching, "ARCHIVE_BYTES", 1000)
+    with pytest.raises(SplitError, match="has more than the 1000 bytes that it may have: refused"):
+        fetch(f"{web.address}/tiny.tar")
+    assert not list(home.rglob("archive"))
+
+
+def test_a_fetch_leaves_some_of_the_disk_free(tiny_split, home, monkeypatch):
+    free = shutil.disk_usage(tiny_split).free
+    monkeypatch.setattr(fetching, "SPARE_BYTES", 2 * free)
+    with pytest.raises(OutputError, match=r"would leave less than \d+ bytes of the disk free"):
+        fetch(str(tiny_split))
+    assert not list(home.rglob("*.h5*"))
 
 
 @pytest.mark.parametrize("name", ["x.tar", "x.tar.gz", "x.zip"])

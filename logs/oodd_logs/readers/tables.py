@@ -9,6 +9,7 @@ import csv
 import io
 import itertools
 import re
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -111,9 +112,10 @@ def table_recording(path: Path, options: Options, separator: str = "") -> Record
         return Recording(stem(path), str(path), {"": _transposed(path, options, separator)})
     layout = layout_of(path, options, separator)
     topic = Topic.of(_table(path, layout, ledger))
+    header = Counter(layout.header)
     for name in topic.names:
         plain = re.sub(r" \(\d+\)$", "", name)
-        if name not in layout.header and layout.header.count(plain) > 1:
+        if name not in header and header[plain] > 1:
             ledger.add("column", "changed", f"{plain!r} stands twice in the header", name=name)
     if layout.units:
         said = f"units of the columns, it seems: {', '.join(layout.units)}"[:200]
