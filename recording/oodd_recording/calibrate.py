@@ -10,13 +10,15 @@ them. Intervals are percentiles of a bootstrap over the seeds.
 A measured strength is one line of JSON in a work file: an interrupted calibration goes on.
 """
 
+import contextlib
+import functools
 import itertools
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from pathlib import Path
-from typing import Any, Final, TextIO
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,8 +57,6 @@ Curve = dict[float, list[float]]
 """Returns of the seeds, in their order, by strength."""
 Pair = tuple[str, str]
 """An environment and a kind of anomaly."""
-_Line = tuple[str, str, str, float]
-"""What returns are of: key, environment, kind, strength."""
 
 
 def setup_of(environment: str, *, whole: bool = False) -> Setup:
@@ -90,11 +90,9 @@ def loss_of(episode: RecordedEpisode, cap: int) -> float:
     return float(losses.sum()) + max(0, cap - max(len(episode.rewards), start))
 
 
-def twins_of(
-    environment: str, first: int = FIRST_SEED, count: int = 0, *, whole: bool = False
-) -> list[RecordedEpisode]:
-    """Return the nominal episodes of some seeds, by default of all that are measured on."""
-    setup, count = setup_of(environment, whole=whole), count or episodes_of(environment)
+def twins_of(environment: str, first: int, count: int, *, whole: bool) -> list[RecordedEpisode]:
+    """Return the nominal episodes of some seeds."""
+    setup = setup_of(environment, whole=whole)
     return [setup.record(first + i) for i in range(count)]
 
 
@@ -200,21 +198,23 @@ def next_strength(
     return 0.0
 
 
-def _expected(
-    environment: str, kind: str, curve: Curve, nominal: Sequence[float], *, whole: bool
-) -> int:
-    """Return how many strengths are still to be measured, if returns lie on lines between these."""
-    curve, base, before = dict(curve), np.array(nominal), len(curve)
+def strengths_ahead(
+    environment: str, kind: str, curve: Curve, nominal: Sequence[float], *, whole: bool = False
+) -> list[float]:
+    """Return the strengths to measure, the next one and those after it if returns lie on lines."""
+    curve, base, ahead = dict(curve), np.array(nominal), []
     while strength := next_strength(environment, kind, curve, nominal, whole=whole):
         points = {0.0: base} | {s: np.array(returns) for s, returns in curve.items()}
         if not curve:  # the bound comes first, and may cost half
             points[2 * strength] = base - abs(base.mean())
-        strengths = sorted(points)
-        i = int(np.searchsorted(strengths, strength))
-        share = (strength - strengths[i - 1]) / (strengths[i] - strengths[i - 1])
-        low, high = points[strengths[i - 1]], points[strengths[i]]
-        curve[strength] = list(low + share * (high - low))
-    return len(curve) - before
+        below, above = (
+            max(s for s in points if s < strength),
+            min(s for s in points if s > strength),
+        )
+        share = (strength - below) / (above - below)
+        curve[strength] = list(points[below] + share * (points[above] - points[below]))
+        ahead.append(strength)
+    return ahead
 
 
 def _arrays(curve: Curve, nominal: Sequence[float]) -> tuple[Floats, Floats, Floats]:
@@ -276,22 +276,30 @@ def _rounded(value: float) -> float:
 
 
 class _Measurement:
-    """Returns of pairs of environment and kind, each measured one a line of a work file."""
+    """Returns of pairs of environment and kind, each that is measured a line of a work file."""
 
-    def __init__(
-        self, pairs: Sequence[Pair], measured: dict[_Line, list[float]], *, whole: bool
-    ) -> None:
-        self._pairs, self._measured, self._whole = pairs, measured, whole
+    def __init__(self, pairs: Sequence[Pair], work: Path, *, whole: bool) -> None:
+        self._pairs, self._work, self._whole = pairs, work, whole
         caps = [WHOLE] if whole else []
         self._keys = {
             e: [GENERATOR_VERSION, setup_of(e).policy.digest, episodes_of(e), *caps]
             for e, _ in pairs
         }
+        self._curves: dict[Pair, Curve] = {(e, k): {} for e, kind in pairs for k in ("", kind)}
+        work.parent.mkdir(parents=True, exist_ok=True)
+        content = work.read_text(encoding="utf-8") if work.exists() else ""
+        self._broken = bool(content) and not content.endswith("\n")  # an interrupted write
+        for text in content.splitlines():
+            with contextlib.suppress(json.JSONDecodeError):
+                line = json.loads(text)
+                pair = line["environment"], line["kind"]
+                if pair in self._curves and line["key"] == self._keys[pair[0]]:
+                    self._curves[pair][line["strength"]] = line["returns"]
 
-    def run(self, pool: Executor, jobs: int, lines: TextIO, progress: Progress) -> None:
+    def run(self, pool: Executor, jobs: int, progress: Progress) -> None:
         """Measure what is missing; seeds are shared out, so that all jobs work to the end."""
-        whole, counts = self._whole, {pair: self._count(*pair) for pair in self._pairs}
-        unfinished = [pair for pair in self._pairs if self._following(*pair) is not None]
+        whole, ahead = self._whole, {pair: self._ahead(*pair) for pair in self._pairs}
+        unfinished = [pair for pair, strengths in ahead.items() if strengths]
         recording: dict[str, list[Future[list[RecordedEpisode]]]] = {}
         for e in dict.fromkeys(e for e, _ in unfinished):
             ends = np.linspace(0, episodes_of(e), jobs + 1, dtype=int).tolist()
@@ -301,74 +309,60 @@ class _Measurement:
                 if i < j
             ]
         parts: dict[str, list[list[RecordedEpisode]]] = {}
-        pending: dict[Future[list[float]], tuple[str, str, float, list[Future[list[float]]]]] = {}
+        pending: dict[Future[list[float]], tuple[Pair, float, list[Future[list[float]]]]] = {}
 
         def tell(what: str) -> None:
-            done = len(parts) + sum(measured for measured, _ in counts.values())
-            total = len(recording) + sum(most for _, most in counts.values())
-            progress(done, total, what)
+            done = len(parts) + sum(len(self._curves[pair]) for pair in self._pairs)
+            left = len(recording) - len(parts) + sum(map(len, ahead.values()))
+            progress(done, done + left, what)
 
-        def go_on(e: str, kind: str) -> None:
-            if (strength := self._following(e, kind)) is not None:
-                given = e, kind, strength
-                futures = [pool.submit(measure, *given, part, whole=whole) for part in parts[e]]
-                pending.update(dict.fromkeys(futures, (*given, futures)))
-            counts[e, kind] = self._count(e, kind)
+        def go_on(pair: Pair) -> None:
+            ahead[pair] = self._ahead(*pair)
+            for strength in ahead[pair][:1]:
+                of_parts = (functools.partial(measure, *pair, strength, p) for p in parts[pair[0]])
+                futures = [pool.submit(of_part, whole=whole) for of_part in of_parts]
+                pending.update(dict.fromkeys(futures, (pair, strength, futures)))
 
         tell("")
         for e, recorded in recording.items():
             parts[e] = [future.result() for future in recorded]
             if not has_loss(e) and not self.nominal(e, ""):
-                self._keep(lines, e, "", 0.0, [return_of(t) for part in parts[e] for t in part])
+                self._keep((e, ""), 0.0, [return_of(t) for part in parts[e] for t in part])
             for pair in unfinished:
                 if pair[0] == e:
-                    go_on(*pair)
+                    go_on(pair)
             tell(e)
         while pending:
             for future in wait(pending, return_when=FIRST_COMPLETED).done:
-                e, kind, strength, together = pending.pop(future)
+                pair, strength, together = pending.pop(future)
                 if not any(other in pending for other in together):
-                    returns = [r for other in together for r in other.result()]
-                    self._keep(lines, e, kind, strength, returns)
-                    go_on(e, kind)
-                    tell(f"{e} {kind}")
+                    self._keep(pair, strength, [r for other in together for r in other.result()])
+                    go_on(pair)
+                    tell(" ".join(pair))
 
-    def _keep(
-        self, lines: TextIO, environment: str, kind: str, strength: float, returns: list[float]
-    ) -> None:
-        pair = {"key": self._keys[environment], "environment": environment, "kind": kind}
-        line = pair | {"strength": strength}
-        lines.write(json.dumps(line | {"returns": returns}) + "\n")
-        lines.flush()
-        self._measured[_identity(line)] = returns
-
-    def _curve(self, environment: str, kind: str) -> Curve:
-        pair = str(self._keys[environment]), environment, kind
-        return {line[3]: r for line, r in self._measured.items() if line[:3] == pair}
+    def _keep(self, pair: Pair, strength: float, returns: list[float]) -> None:
+        line = {"key": self._keys[pair[0]], "environment": pair[0], "kind": pair[1]}
+        text = json.dumps(line | {"strength": strength, "returns": returns})
+        with self._work.open("a", encoding="utf-8") as file:
+            file.write("\n" * self._broken + text + "\n")
+        self._broken = False
+        self._curves[pair][strength] = returns
 
     def anomalous(self, environment: str, kind: str) -> Curve:
         """Return the returns by strength."""
-        return {s: returns for s, returns in self._curve(environment, kind).items() if s}
+        return {s: returns for s, returns in self._curves[environment, kind].items() if s}
 
     def nominal(self, environment: str, kind: str) -> list[float]:
         """Return the nominal returns; of losses, which count from the onset, those of a kind."""
-        curve = self._curve(environment, kind if has_loss(environment) else "")
-        return curve.get(0.0, [])
+        return self._curves[environment, kind if has_loss(environment) else ""].get(0.0, [])
 
-    def _following(self, environment: str, kind: str) -> float | None:
-        """Return the strength to measure next, the nominal one first; None after the last."""
-        if not (nominal := self.nominal(environment, kind)):
-            return 0.0 if has_loss(environment) else bound_of(environment, kind)
-        curve = self.anomalous(environment, kind)
-        return next_strength(environment, kind, curve, nominal, whole=self._whole) or None
-
-    def _count(self, environment: str, kind: str) -> tuple[int, int]:
-        """Return how many strengths are measured, and how many there may be in the end."""
-        done, nominal = self._curve(environment, kind), self.nominal(environment, kind)
-        curve = self.anomalous(environment, kind) if nominal else {}
-        guess = nominal or [1.0, 1.0]
-        left = _expected(environment, kind, curve, guess, whole=self._whole)
-        return len(done), len(done) + left + (has_loss(environment) and not nominal)
+    def _ahead(self, environment: str, kind: str) -> list[float]:
+        """Return the strengths to measure, the nominal one of a loss first."""
+        nominal, curve = self.nominal(environment, kind), self.anomalous(environment, kind)
+        if nominal:
+            return strengths_ahead(environment, kind, curve, nominal, whole=self._whole)
+        ahead = strengths_ahead(environment, kind, {}, [1.0, 1.0], whole=self._whole)
+        return [*([0.0] if has_loss(environment) else []), *ahead]
 
 
 def calibrate(
@@ -394,12 +388,9 @@ def calibrate(
         if kind in kinds_of(e)
         and (not whole or (kind in TABLE1 and e in ENVIRONMENTS and not ENVIRONMENTS[e].discrete))
     ]
-    returns, broken = _read_work(work)
-    measurement = _Measurement(pairs, returns, whole=whole)
-    work.parent.mkdir(parents=True, exist_ok=True)
-    with workers(jobs) as pool, work.open("a", encoding="utf-8") as lines:
-        lines.write("\n" * broken)
-        measurement.run(pool, jobs or available_cores(), lines, progress)
+    measurement = _Measurement(pairs, work, whole=whole)
+    with workers(jobs) as pool:
+        measurement.run(pool, jobs or available_cores(), progress)
     ladder = json.loads(output.read_text(encoding="utf-8")) if output.exists() else {}
     for e, kind in pairs:
         curve, nominal = measurement.anomalous(e, kind), measurement.nominal(e, kind)
@@ -408,20 +399,3 @@ def calibrate(
     ordered = {e: ladder[e] for e in in_order(ladder, ENVIRONMENTS)}
     write_text(output, json.dumps(ordered, indent=1) + "\n")
     return ordered
-
-
-def _identity(line: Mapping[str, Any]) -> _Line:
-    return str(line["key"]), line["environment"], line["kind"], line["strength"]
-
-
-def _read_work(work: Path) -> tuple[dict[_Line, list[float]], bool]:
-    """Return measured returns, and whether the last line is the begin of an interrupted write."""
-    measured: dict[_Line, list[float]] = {}
-    content = work.read_text(encoding="utf-8") if work.exists() else ""
-    for text in content.splitlines():
-        try:
-            line = json.loads(text)
-        except json.JSONDecodeError:
-            continue
-        measured[_identity(line)] = line["returns"]
-    return measured, not content.endswith("\n") and bool(content)
