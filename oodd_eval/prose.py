@@ -128,49 +128,50 @@ def print_table(table: Table, console: Console, width: int = 0) -> None:
     """Print one table within a width, by default the console's, its rows as rows."""
     print_prose(table.title, console, "bold")
     for part in _fitting(table, width or console.width):
-        rows = [part.header, *part.rows]
-        colours = ["", "", *(part.colours or [""] * len(part.rows))]
-        lines = iter(_lines_of(part))
-        for n, colour in zip([_height(rows[0]), 1, *map(_height, rows[1:])], colours, strict=True):
-            console.print(Text("\n".join(itertools.islice(lines, n)), colour))
+        rule, *lines = _lines_of(part)
+        colours = part.colours or [""] * len(part.rows)
+        for row, colour in zip((part.header, *part.rows), ("", *colours), strict=True):
+            n = 1 + max(text.count("\n") for text in row)
+            console.print(Text("\n".join([*lines[:n], *[rule] * (row is part.header)]), colour))
+            del lines[:n]
         console.print("")
     if table.note:
         print_prose(table.note + "\n", console, "dim")
 
 
-def _height(row: Sequence[str]) -> int:
-    return 1 + max(text.count("\n") for text in row)
-
-
 def _lines_of(table: Table) -> list[str]:
-    """Return the lines of a table with a rule below its header, no column wider than its texts."""
-    texts = [table.header, *table.rows]
+    """Return a rule, and the lines of header and rows, no column wider than its texts."""
     layout: dict[str, Any] = {"colalign": table.alignment, "disable_numparse": True}
-    rule, *lines, _ = tabulate(texts, tablefmt="simple", **layout).splitlines()
-    n = _height(table.header)
-    return [line.rstrip() for line in (*lines[:n], rule, *lines[n:])]
+    lines = tabulate([table.header, *table.rows], tablefmt="simple", **layout).splitlines()
+    return [line.rstrip() for line in lines[:-1]]
 
 
 def _fitting(table: Table, width: int) -> list[Table]:
     """Return what of a table fits: its first shape that does, or parts of its columns."""
     shapes = [table, *table.narrower]
-    for i in reversed(range(table.labels, len(table.header)) if table.whole else ()):
-        bare = [
-            [*r[:i], *(_INTERVAL.sub("", text) for text in r[i : i + 1]), *r[i + 1 :]]
-            for r in shapes[-1].rows
-        ]
-        shapes.append(replace(shapes[-1], rows=bare))
+    if table.whole:  # intervals lose their spaces, and then one after the other goes
+        last, columns = shapes[-1], range(table.labels, len(shapes[-1].header))
+        shapes.append(_cut(last, table.labels, r"(\[\S+), ", r"\1,"))
+        shapes += [_cut(last, i, r" \[[^\]]*\]", "") for i in reversed(columns)]
     for shape in itertools.chain(*((shape, _wrapped(shape, width)) for shape in shapes)):
-        if _width(shape) <= width:
+        if len(_lines_of(shape)[0]) <= width:
             return [shape]
-    parts = [[*range(shape.labels)]]
+    parts = [labels := [*range(shape.labels)]]
     for column in range(shape.labels, len(shape.header)):
         wider = [*parts[-1], column]
-        if shape.whole or len(wider) == shape.labels + 1 or _width(shape.columns(wider)) <= width:
+        fits = len(_lines_of(shape.columns(wider))[0]) <= width
+        if shape.whole or fits or parts[-1] == labels:
             parts[-1] = wider
         else:
-            parts.append([*range(shape.labels), column])
+            parts.append([*labels, column])
     return [shape.columns(part) for part in parts]
+
+
+def _cut(table: Table, first: int, pattern: str, by: str) -> Table:
+    """Return a table with what matches a pattern replaced, from a first column on."""
+    figures = [[re.sub(pattern, by, text) for text in row[first:]] for row in table.rows]
+    rows = [[*r[:first], *f] for r, f in zip(table.rows, figures, strict=True)]
+    return replace(table, rows=rows)
 
 
 def _wrapped(table: Table, width: int) -> Table:
@@ -181,9 +182,7 @@ def _wrapped(table: Table, width: int) -> Table:
     columns = [[row[i] for row in table.rows] for i in range(len(table.header))]
     room = [max(11 if i < table.labels else _NARROW, *map(len, c)) for i, c in enumerate(columns)]
     header = [_lines(text, n) for text, n in zip(table.header, room, strict=True)]
-    sizes = [
-        max(map(len, "\n".join([h, *c]).split("\n"))) for h, c in zip(header, columns, strict=True)
-    ]
+    sizes = [*map(len, _lines_of(replace(table, header=header))[0].split())]
     for i in sorted(range(table.labels), key=sizes.__getitem__, reverse=True):
         # Of a whole table labels get what other columns leave, but no word is divided for them.
         pieces = [len(piece) for text in columns[i] for piece in _PARTS.split(text) if piece]
@@ -213,9 +212,3 @@ _PARTS: Final = re.compile(r"(\s+)|(?<=[-\[,:.=])(?=[^-\[,:.=\s])|(?<=[a-z])(?=[
 """Ends of lines are between words, and in names behind what separates their parts."""
 
 _WORD: Final = re.compile(r"[^\W\d_]+")
-
-_INTERVAL: Final = re.compile(r" \[[^\]]*\]")
-
-
-def _width(table: Table) -> int:
-    return max(map(len, _lines_of(table)))

@@ -167,9 +167,9 @@ def run(options: Options) -> int:
     say_notes(results.notes)
     if done.records:
         records, path = results.records(), results.path
-        shown = {name: getattr(options, name) for name in ("intervals", "level", "paper")}
+        printed = {name: getattr(options, name) for name in ("intervals", "level", "paper")}
         report = Report(
-            records, **shown, units=split.units, remarks=[*costly_voices(records, results)]
+            records, **printed, units=split.units, remarks=[*costly_voices(records, results)]
         )
         write_text(path / REPORT, FORMATS["markdown"].render(report))
         if options.verbosity >= 0 and any(record.ok for record in done.records):

@@ -86,7 +86,7 @@ class Report:
             if all((table.header, table.rows) != (t.header, t.rows) for t in distinct):
                 distinct.append(table)
         if self.detail == "brief":
-            return Section(f"Split {board.conditions}", tables=distinct, verdict=verdict)
+            return Section(f"S{str(board.conditions)[1:]}", tables=distinct, verdict=verdict)
         return Section(
             f"Split {board.split}",
             [f"Cells: {counts}."],
@@ -103,7 +103,7 @@ class Report:
         headline = means.headline()
         strengths = StrengthTables(board, self.intervals, self.units).overview(places=not brief)
         if brief:
-            yield headline or next(iter(strengths), None)
+            yield headline or next(map(_narrowing, strengths), None)
             yield means.published()
         else:
             yield headline
@@ -143,6 +143,15 @@ def _in_order(board: Board) -> Board:
     """Return a board whose rows have the order of all its tables, the best mean first."""
     by_row = grouped(board.records, lambda r: r.setting)
     return Board([r for row in tables.best_first(board) for r in by_row[row]])
+
+
+def _narrowing(table: Table) -> Table:
+    """Return a table of strengths that leaves out columns where it is too wide, never parted."""
+    last = range(5, len(table.header) + 1)  # behind the threshold, of how many pairs, and beyond
+    shorter = [table.columns([0, 1, *last[i:-1]]) for i in range(len(last))]
+    sentences = table.note.split(". ")[:2]
+    note = f"{'. '.join(sentences).removesuffix('.')}."
+    return replace(table, whole=True, narrower=shorter, note=note)
 
 
 def findings_of(board: Board, level: str = "") -> list[str]:

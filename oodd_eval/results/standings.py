@@ -246,8 +246,8 @@ def own_row(board: Board) -> Setting:
     """
     plugins = {r.setting: r.plugin for r in board.records}
     shipped = {row for row, name in plugins.items() if name.startswith(f"{SHIPPED}:")}
-    own = (row for row in best_first(board) if row not in shipped or ":" in row.detector)
-    return next(own, board.entries[0])
+    others = (row for row in best_first(board) if row not in shipped or ":" in row.detector)
+    return next(others, board.entries[0])
 
 
 def verdict_of(board: Board, level: str = "") -> str:
@@ -269,37 +269,36 @@ def verdict_of(board: Board, level: str = "") -> str:
     str
         Empty where the row has no figure that rows are compared by, and others have.
     """
-    own, metric = own_row(board), ordering_metric(board)
+    mine, metric = own_row(board), ordering_metric(board)
     knowing = {r.setting for r in board.records if r.training not in ("nominal", "failures")}
     band = [
         row
         for row in best_first(board)
-        if (row in board.supervised) == (own in board.supervised)
-        and (row == own or row not in knowing)
+        if (row in board.supervised) == (mine in board.supervised)
+        and (row == mine or row not in knowing)
     ]
     if len(band) == 1:
-        return _in_words(board, own, level or board.level)
-    i = band.index(own)
+        return _in_words(board, mine, level or board.level)
+    i, n = band.index(mine), len(band)
     rival = band[0] if i else band[1]
-    n = len(band)
     many = f"number {i + 1} of {n}"
-    place = f"{own} is {many if n > len(_PLACES) else f'{_PLACES[i]} of {_NUMBERS[n - 1]}'}"
-    if len(board.entries) > len(band):
-        place += f" {'rows that learn from failures' if own in board.supervised else 'ranked rows'}"
-    means = [board.of(row, Column(metric)) for row in (own, rival)]
+    rank = f"{mine} is {many if n > len(_PLACES) else f'{_PLACES[i]} of {_NUMBERS[n - 1]}'}"
+    if len(board.entries) > n:
+        rank += f" {'rows that learn from failures' if mine in board.supervised else 'ranked rows'}"
+    means = [board.of(row, Column(metric)) for row in (mine, rival)]
     try:
-        test = compare_rows([r for r in board.records if r.ok], str(own), str(rival), metric)
+        test = compare_rows([r for r in board.records if r.ok], str(mine), str(rival), metric)
     except ResultsError:  # without a cell in common
         if means[0].state:
-            return f"{own} has no place: {means[0].state}."
-        return "" if math.isnan(means[0].value) else f"{place}."
+            return f"{mine} has no place: {means[0].state}."
+        return "" if math.isnan(means[0].value) else f"{rank}."
     ahead = "ahead of" if test.first_is_better else "behind"
     scope = f" in {metric_info(metric).phrase}"
     if any(mean.state or mean.partial for mean in means):
         scope += f", over the {counted(test.cells, 'cell(s)')} that both have"
     if test.told_apart:
-        return f"{place}, {test.amount} {ahead} {rival}{scope}."
-    return f"{place} and cannot be told from {rival}: {test.amount} {ahead} it{scope}."
+        return f"{rank}, {test.amount} {ahead} {rival}{scope}."
+    return f"{rank} and cannot be told from {rival}: {test.amount} {ahead} it{scope}."
 
 
 _PLACES: Final = (

@@ -191,7 +191,7 @@ class Tables:
         )
         if first and len(places) > 1:
             worst = [board.worst(entry, places) or ("", Value()) for entry in self.order]
-            cells = [f"{place} {show_value(mean, metric)}".strip() for place, mean in worst]
+            cells = [f"{where} {show_value(mean, metric)}".strip() for where, mean in worst]
             cells.insert(0, WORST if several else "worst anomaly")
             for row, text in zip((short.header, *short.rows), cells, strict=True):
                 row.insert(short.labels + 1, text)
@@ -222,7 +222,7 @@ class Tables:
             f"{_FALSE}{promise}." if alarms else _joined(*missing_level(board, usual)),
             f"{metric_info(metric).title}: {_MEANINGS[metric]}; 50 is chance." * bool(first),
             "Means are over all strengths." * _has_strengths(board),
-            _FOUND * any(column.metric.startswith("missed") for column in alarms),
+            _FINDS * any(column.metric.startswith("missed") for column in alarms),
         ]
         return [f"{note[0].upper()}{note[1:]}" for note in notes if note]
 
@@ -435,7 +435,7 @@ _TABLE_5: Final = ("auc", "delay", "far")
 _FIRST: Final = (f"found_within_{catalogue.FOUND_WITHIN[0]}", "missed", "false_episodes")
 _OUTCOMES: Final = ("found_outcome", "balanced_outcome", "false_episodes")
 _FALSE: Final = "False episodes: nominal ones with an alarm"
-_FOUND: Final = "Found, missed: anomalous episodes with an alarm within 20 rows, and with none."
+_FINDS: Final = "Found, missed: anomalous episodes with an alarm within 20 rows, and with none."
 _MEANINGS: Final = {
     catalogue.RANKING: "how often a row scores higher under the anomaly",
     POOLED[0]: "how often anomalous rows score above nominal ones",

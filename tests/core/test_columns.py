@@ -308,7 +308,7 @@ def test_a_flag_is_judged_at_its_own_operating_point_and_promises_nothing(
     capsys.readouterr()
     assert main(["show", str(directory), "--split", str(scored.path)]) == 0
     out = " ".join(capsys.readouterr().out.split())
-    assert "flag:alarm: a flag is an alarm already" in out
+    assert "\N{DOUBLE DAGGER}: a flag is an alarm already" in out
     assert "earlier versions" not in out
     assert (
         main(["show", str(directory), "--split", str(scored.path), "--alarm", "cusum", "--json"])

@@ -653,7 +653,7 @@ EIGHT = [*TABLE1]
     [
         (five_columns(), 120, ["worst environment"], 2),
         (five_columns(names=["mewma", "rf"]), 80, ["worst environment"], 2),
-        (five_columns(), 80, ["worst environment"], 1),
+        (five_columns(), 80, ["worst environment"], 2),
         (five_columns(), 60, ["worst environment"], 0),
         (five_columns(EIGHT, ["hopper"], ["mewma"]), 150, EIGHT, 2),
         (five_columns(EIGHT, ["hopper"], ["mewma"]), 120, EIGHT, 2),
