@@ -34,7 +34,10 @@ Returns = Mapping[str, Mapping[str, Sequence[float]]]  # by environment and kind
 
 @dataclass(frozen=True, slots=True)
 class Reproduction:
-    """The tier, data and sizes of a reproduction, and the number of units of all experiments."""
+    """The tier, data and sizes of a reproduction, and the number of units of all experiments.
+
+    Records of version 0.1.0 have no time: the header has the `date` of the last one, ISO 8601.
+    """
 
     tier: Tier
     split: str
@@ -44,6 +47,7 @@ class Reproduction:
     calibration: int
     test: int
     units: int
+    date: str = ""
 
     def select(self, records: Iterable[Record]) -> list[Record]:
         """Return the records that belong to it: its whole data, its settings, its seeds.

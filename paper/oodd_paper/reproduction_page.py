@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS, TABLE1, paper_tables
+from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, PROTOCOL, SPLITS, TABLE1, paper_tables
 from oodd_eval.metrics.catalogue import metric_info
 from oodd_eval.prose import Table
 from oodd_eval.results.record import Record
@@ -263,6 +263,8 @@ def front_page(
     names = ("oodd_eval", "python", "numpy")
     made_by = ([f"{n} {r.provenance[n]}" for n in names if n in r.provenance] for r in records)
     software = sorted({", ".join(versions) or "unknown versions" for versions in made_by})
+    times = [str(r.provenance["time"]) for r in records if "time" in r.provenance]
+    versions = {r.provenance["oodd_eval"] for r in records if "oodd_eval" in r.provenance}
     devices = sorted({str(r.provenance["device"]) for r in records if "device" in r.provenance})
     software += [f"networks on {device}" for device in devices]
     if failed:
@@ -273,6 +275,10 @@ def front_page(
     return fill(
         "page",
         tier=tier.name,
+        protocol=reproduction.protocol,
+        versions=" and ".join(f"oodd-eval {v}" for v in sorted(versions)) or "unknown versions",
+        date=max(times, default=reproduction.date)[:10],
+        today=PROTOCOL if reproduction.protocol < PROTOCOL else "",
         data=_data(reproduction),
         near=tier.seeds_near,
         far="" if tier.seeds_far == tier.seeds_near else tier.seeds_far,
