@@ -1,6 +1,7 @@
 """``oodd-eval list``: one line each, the name first."""
 
 import re
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import asdict
 from typing import Final, TypeVar
@@ -10,7 +11,7 @@ from tabulate import tabulate
 
 from oodd_eval.cli import Options, command, say_notes
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS
-from oodd_eval.data.registry import AnomalySpec, EnvironmentSpec
+from oodd_eval.data.registry import AnomalySpec, EnvironmentSpec, long_name
 from oodd_eval.metrics.catalogue import (
     ATTRIBUTION,
     GUARANTEED,
@@ -24,7 +25,7 @@ from oodd_eval.names import check_known, counted
 from oodd_eval.plugins.contract import training_mark
 from oodd_eval.plugins.discovery import Offer, Plugins, discover
 
-T = TypeVar("T")
+T = TypeVar("T", EnvironmentSpec, AnomalySpec)
 Rows = Iterable[tuple[str, ...]]
 
 KINDS: Final = ("detectors", "envs", "anomalies", "splits", "metrics")
@@ -72,10 +73,11 @@ def rows(kind: str, plugins: Plugins) -> Rows:
 
 def _custom(plugins: Plugins, kind: type[T]) -> Iterable[tuple[T, str, str]]:
     """Yield the environments, or the anomalies, of plug-ins with their name and origin."""
-    offered = plugins.custom_specs
-    for spec in offered.specs:
-        if isinstance(spec, kind):
-            yield spec, offered.shortest_name(spec), plugins.origin(spec.plugin)
+    specs = [spec for spec in plugins.custom_specs.specs if isinstance(spec, kind)]
+    names = Counter(spec.name for spec in specs)
+    for spec in specs:
+        name = spec.name if names[spec.name] == 1 else long_name(spec)
+        yield spec, name, plugins.origin(spec.plugin)
 
 
 def _imported() -> Rows:

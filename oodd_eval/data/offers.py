@@ -54,11 +54,6 @@ class OfferedSpecs:
         of_sort = (spec for spec in self.specs if isinstance(spec, sort))
         return [spec for spec in of_sort if name in (spec.name, long_name(spec))]
 
-    def shortest_name(self, spec: Spec) -> str:
-        """Return the name that means a spec alone: the short one where no other has it."""
-        same = [s for s in self.specs if s.name == spec.name and type(s) is type(spec)]
-        return spec.name if len(same) == 1 else long_name(spec)
-
     def meanings(self, name: str) -> list[Spec]:
         """Return the environment or kind that a name means, or nothing.
 

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 
 
 _Spec = TypeVar("_Spec", bound=Any)  # what plug-ins offer under a name
+_Check = Callable[[Any], object]
 
 _BUILT_IN: Final = "trivial"
 RESTRICT: Final = "OODD_EVAL_PLUGINS"
@@ -210,24 +211,18 @@ class Plugins:
         from oodd_eval.data.offers import OfferedSpecs, check_spec  # noqa: PLC0415
 
         specs = tuple(s for s, _ in self._offered(lambda p: p.custom_specs(), check_spec))
-        broken = {
-            name: f"{b.plugin!r} of {b.distribution}: {b.reason}"
-            for b in self.broken
-            for name in (b.plugin, *self._claims.get(b.plugin, ()))
-            if name not in {*ENVIRONMENTS, *ANOMALIES}
-        }
-        return OfferedSpecs(specs, broken)
+        names = ((n, b) for b in self.broken for n in (b.plugin, *self._claims.get(b.plugin, ())))
+        reasons = {n: f"{b.plugin!r} of {b.distribution}: {b.reason}" for n, b in names}
+        return OfferedSpecs(
+            specs, {n: reasons[n] for n in {*reasons} - {*ENVIRONMENTS, *ANOMALIES}}
+        )
 
     def origin(self, plugin: str) -> str:
         """Return what messages call a loaded plug-in."""
         return name_of(self.loaded[plugin].point)
 
     def offered_by(
-        self,
-        hook: str,
-        kind: type[_Spec],
-        check: Callable[[_Spec], object],
-        taken: Collection[str] = (),
+        self, hook: str, kind: type[_Spec], check: _Check, taken: Collection[str] = ()
     ) -> list[_Spec]:
         """Return what a hook of plug-ins offers; all are loaded.
 
@@ -327,7 +322,7 @@ class Plugins:
                 self._listener(self.broken[-1])
 
     def _offered(
-        self, of: Callable[[Plugin], list[_Spec]], check: Callable[[_Spec], object]
+        self, of: Callable[[Plugin], list[_Spec]], check: _Check
     ) -> list[tuple[_Spec, str]]:
         """Return what all plug-ins offer, checked, with the name of the plug-in."""
         for point in list(self._waiting):
