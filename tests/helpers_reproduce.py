@@ -35,6 +35,7 @@ def make(name):
 class Sizes:
     members: int = parameter(5)
     samples: int = parameter(8)
+    updates: int = parameter(1250)
 
 @hookimpl
 def oodd_detectors():
