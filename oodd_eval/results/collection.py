@@ -23,7 +23,7 @@ from oodd_eval.results.directory import ResultsDirectory, ScoreFile
 from oodd_eval.results.evaluate import Rules, ScoredEpisode, must_be_of, stored_scores, with_stream
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.record import Record, summary
-from oodd_eval.results.render import FORMATS
+from oodd_eval.results.render.text import html_sections
 from oodd_eval.results.report import Report, flat
 from oodd_eval.results.standings import PairedComparison, compare_rows, row_named
 from oodd_eval.results.strengths import (
@@ -95,7 +95,7 @@ class Results(Sequence[Record]):
     def _repr_html_(self) -> str:
         """Return the tables that ``oodd-eval show`` prints, for notebooks."""
         lines = repr(self), *self._failures
-        tables = FORMATS["html"].render(self._report)
+        tables = html_sections(self._report.sections)
         return "".join(f"<p>{escape(text)}</p>\n" for text in lines) + tables
 
     @property

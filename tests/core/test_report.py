@@ -9,6 +9,7 @@ import re
 from dataclasses import replace
 from html.parser import HTMLParser
 
+import helpers_browser
 import numpy as np
 import pytest
 from helpers_records import example, make_record
@@ -129,6 +130,23 @@ def test_formats_for_people_have_the_same_titles_and_cells(name):
         assert table.rows[0][-1].partition(" [")[0].rstrip("*") in text
         assert table.title.partition("%")[0].rstrip("( ") in text
     assert "<b>" in text if name == "html" else "<b>" not in text.replace("\\<b\\>", "")
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(helpers_browser.programs() is None, reason="no Chromium and chromedriver")
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_a_report_in_html_is_a_page_for_every_width(theme, tmp_path):
+    records = [*example(), make_record("x", status="error", reason="because-" * 40)]
+    page = tmp_path / "report.html"
+    page.write_text(rendered(records, "html"), encoding="utf-8")
+    with helpers_browser.launch(tmp_path) as browser, browser.colours(theme), browser.narrow(390):
+        browser.open(page.as_uri())
+        assert browser.run("return [document.title, document.documentElement.lang]") == [
+            Report(records).title,
+            "en",
+        ]
+        assert browser.run("return document.querySelector('table').scrollWidth") > 390
+        assert browser.defects(390) == []
 
 
 def test_latex_is_plain_tabulars_with_escaped_text():

@@ -19,6 +19,25 @@ _LATEX: Final = str.maketrans(
     | {"Δ": r"$\Delta$", "µ": r"$\mu$", "≤": r"$\leq$", "†": r"$\dagger$", "\N{EN DASH}": "--"}
 )
 
+_PAGE: Final = """<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{title}</title>
+<style>
+:root {{ color-scheme: light dark; font: 1rem/1.5 system-ui, sans-serif; }}
+body {{ margin: 1rem auto; max-width: 70rem; padding: 0 1rem; overflow-wrap: anywhere; }}
+table {{ border-collapse: collapse; display: block; overflow: auto; white-space: nowrap; }}
+th, td {{ border-bottom: 1px solid #8888; padding: 0.2rem 0.6rem; }}
+</style>
+</head>
+<body>
+<h1>{title}</h1>
+{sections}</body>
+</html>
+"""
+
 
 @renders("markdown", "Markdown, everything in it")
 def markdown(report: Report) -> str:
@@ -76,13 +95,18 @@ def escape(text: str) -> str:
 
 @renders("html", "HTML")
 def html(report: Report) -> str:
-    """Return a report as HTML, without a page around it."""
-    return html_sections(report.sections)
+    """Return a report as a page of HTML; wide tables scroll, the page does not."""
+    title = escape_html(report.title)
+    return _PAGE.format(title=title, sections=html_sections(report.sections, level=2))
 
 
-def html_sections(sections: Sequence[Section]) -> str:
-    """Return sections as HTML."""
-    marks = {"title": "<h3>{}</h3>", "sentence": "<p>{}</p>", "table": "<h4>{}</h4>"}
+def html_sections(sections: Sequence[Section], level: int = 3) -> str:
+    """Return sections as HTML, without a page around it; their titles have headings of a level."""
+    marks = {
+        "title": f"<h{level}>{{}}</h{level}>",
+        "sentence": "<p>{}</p>",
+        "table": f"<h{level + 1}>{{}}</h{level + 1}>",
+    }
     # tabulate's layout escapes the cells.
     parts = (
         grid(part, "html") if isinstance(part, Table) else marks[kind].format(escape_html(part))
