@@ -332,6 +332,7 @@ class StrengthTables:
         order = [entry for entry in rows if entry in by_row]
         tables = [self.separability(order)] if ranked else []
         if any(by_row.values()):  # else no level of 5 %, with few calibration episodes
+            places = places and (self.strengths.scaled or len(board.environments) > 1)
             single = [self.by_place(e, by_row[e]) for e in order if places and by_row[e]]
             over_all, by_kind = [self.relative(order), *tables], self.by_kind(order)
             tables = [*over_all, by_kind] if self._unit_of_mean else [by_kind, *over_all]

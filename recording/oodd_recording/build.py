@@ -62,11 +62,8 @@ from oodd_recording.registered import (
 from oodd_recording.simulator import how_to_install
 from oodd_recording.values import bound_of, unit_of
 
-CHUNK: Final = {
-    "train": 25,
-    "calibration": 25,
-    "test": 5,
-}  # seeds; a test seed is nine episodes, or hundreds
+CHUNK: Final = {"train": 25, "calibration": 25, "test": 5}
+"""Seeds of a chunk; a test seed is nine episodes, or hundreds."""
 WORK: Final = ".building"  # the work folder, gone when the split is whole
 MOST_CANDIDATES: Final = 10  # seeds looked at per test trajectory for twins that are long enough
 

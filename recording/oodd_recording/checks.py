@@ -81,55 +81,53 @@ class Subject:
                 raise SimulationError(f"with seed {twin.seed} it differs from its twin {when}")
 
 
-class Blinking(Fault):
-    """A fault that begins and ends again before every transition."""
+class Around(Fault):
+    """A fault that does what another one does."""
 
     def __init__(self, fault: Fault) -> None:
         super().__init__(fault.parameters)
-        self._fault = fault
-        self._rows: Sequence[Row] = ()
+        self.fault = fault
 
     def begin(self, simulator: Any, rows: Sequence[Row]) -> None:
-        self._rows = rows
+        self.fault.begin(simulator, rows)
 
     def command(self, action: Any, simulator: Any) -> Any:
-        self._fault.begin(simulator, self._rows)
-        self._fault.command(copy.copy(action), simulator)
-        self._fault.end(simulator)
+        return self.fault.command(action, simulator)
+
+
+class Blinking(Around):
+    """A fault that begins and ends again before every transition."""
+
+    rows: Sequence[Row] = ()
+
+    def begin(self, simulator: Any, rows: Sequence[Row]) -> None:
+        self.rows = rows
+
+    def command(self, action: Any, simulator: Any) -> Any:
+        self.fault.begin(simulator, self.rows)
+        self.fault.command(copy.copy(action), simulator)
+        self.fault.end(simulator)
         simulator.restore()
         return action
 
 
-class Shareless(Fault):
+class Shareless(Around):
     """A fault of which a share of 0 is in force; rows are mixed by it elsewhere."""
 
     def __init__(self, fault: Fault) -> None:
-        super().__init__(fault.parameters)
-        self._fault, fault.share = fault, 0.0
-
-    def begin(self, simulator: Any, rows: Sequence[Row]) -> None:
-        self._fault.begin(simulator, rows)
-
-    def command(self, action: Any, simulator: Any) -> Any:
-        return self._fault.command(action, simulator)
+        super().__init__(fault)
+        fault.share = 0.0
 
 
-class Watched(Fault):
+class Watched(Around):
     """A fault whose rows are compared: `corrupted` are the numbers of the columns that differ."""
 
     def __init__(self, fault: Fault) -> None:
-        super().__init__(fault.parameters)
-        self._fault = fault
+        super().__init__(fault)
         self.corrupted: set[int] = set()
 
-    def begin(self, simulator: Any, rows: Sequence[Row]) -> None:
-        self._fault.begin(simulator, rows)
-
-    def command(self, action: Any, simulator: Any) -> Any:
-        return self._fault.command(action, simulator)
-
     def observe(self, row: Row, step: int) -> Row:
-        changed = self._fault.observe(row.copy(), step)
+        changed = self.fault.observe(row.copy(), step)
         self.corrupted |= {int(i) for i in np.flatnonzero(changed != row)}
         return changed
 
@@ -256,10 +254,8 @@ def check_strength(subject: Subject) -> None:
 
 def check_sensors(subject: Subject) -> None:
     """Only measured sensors are corrupted, and all that are stand in the fault's parameters."""
-    columns, strength = (
-        environment_spec(subject.environment).sensors,
-        bound_of(subject.environment, subject.kind),
-    )
+    columns = environment_spec(subject.environment).sensors
+    strength = bound_of(subject.environment, subject.kind)
     for twin in subject.twins:
         watched: list[Watched] = []
 

@@ -137,18 +137,6 @@ def record_seed(
     return episodes
 
 
-def record_nominal(
-    environment: str,
-    seed: int,
-    *,
-    policy: Policy,
-    episode_cap: int | None = None,
-    noise: float = 0.0,
-) -> RecordedEpisode:
-    """Record the nominal episode of a seed, a whole number from 0; see `record_seed`."""
-    return Setup(environment, policy, episode_cap, noise).record(seed)
-
-
 def evaluate_policy(
     environment: str,
     policy: Policy,

@@ -4,17 +4,15 @@ The evaluator knows them by name only (`oodd_eval.cli.main`).
 """
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import click
 from oodd_checks.commands.check import STYLES
 from oodd_checks.conformance import CheckReport, Result
-from rich.live import Live
 
 from oodd_eval.cli import (
     COUNT,
@@ -32,6 +30,7 @@ from oodd_eval.cli import (
 )
 from oodd_eval.cli.console import make_console
 from oodd_eval.cli.plugins import discovered
+from oodd_eval.cli.progress import pace_shown
 from oodd_eval.data.condition import Condition
 from oodd_eval.data.facts import (
     CUSTOM_SEED_BASES,
@@ -54,8 +53,7 @@ from oodd_eval.data.registry import (
 from oodd_eval.data.split import data_home, load_split
 from oodd_eval.errors import UsageError
 from oodd_eval.names import Predicate, assignment, check_known, counted, select
-from oodd_eval.scoring.display import SILENCE, Pace
-from oodd_recording.build import Progress, build_split
+from oodd_recording.build import build_split
 from oodd_recording.calibrate import calibrate as find_strengths
 from oodd_recording.checks import custom_checks
 from oodd_recording.closed_loop import evaluate_policy
@@ -218,37 +216,9 @@ def _definition(options: Options) -> SplitDefinition:
             f"--seed-base is {seed_base}, expected {CUSTOM_SEED_BASES.start} to "
             f"{CUSTOM_SEED_BASES.stop - 1}: other bases are those of published splits and policies"
         )
-    return SplitDefinition(
-        name,
-        train,
-        calibration,
-        test,
-        cap,
-        seed_base,
-        suite=options.suite or "table1",
-        noise=options.noise or 0.0,
-        strengths=strengths,
-    )
-
-
-@contextmanager
-def _shown(noun: str, *, quiet: bool) -> Iterator[Progress]:
-    """Show how much is done and what is left: a bar on a terminal, else a line now and then."""
-    console, said = make_console(quiet=quiet), -SILENCE
-    pace = Pace(0, time.perf_counter(), noun=noun)
-
-    def show(done: int, total: int, what: str) -> None:
-        nonlocal said
-        pace.total, now = total, time.perf_counter()
-        while pace.done < done:
-            pace.add(now, resumed=not what)
-        if not console.is_terminal and now >= said + SILENCE:
-            said = now
-            console.print(f"{pace}  {what}".rstrip())
-
-    live = Live(pace, console=console, transient=True, refresh_per_second=2)
-    with live if console.is_terminal and not quiet else nullcontext():
-        yield show
+    more: dict[str, Any] = {"noise": options.noise or 0.0, "strengths": strengths}
+    sizes_of_split = train, calibration, test, cap, seed_base
+    return SplitDefinition(name, *sizes_of_split, suite=options.suite or "table1", **more)
 
 
 @command("data calibrate --env cartpole --output ladder.json", plugins=True)
@@ -276,7 +246,7 @@ def calibrate(options: Options) -> int:
     known = [spec.name for spec in registered() if isinstance(spec, AnomalySpec)]
     work = options.work or options.output.with_name(options.output.name + ".work")
     selected = select("anomaly", ",".join(map(short_name, kinds)), known)
-    with _shown("evaluations", quiet=options.verbosity < 0) as progress:
+    with pace_shown("evaluations", quiet=options.verbosity < 0) as progress:
         strengths = find_strengths(
             options.output,
             work,

@@ -14,9 +14,8 @@ SEASON_RUNGS: Final = ("kept95", "kept90", "kept75", "loss5", "loss10", "loss25"
 """Rungs that strengths are drawn from: of the policy's return, or of the growth of the loss."""
 
 KINDS: Final = 4  # of each group in an environment, or as many as it has
-NOISE: Final = (
-    0.01  # of the benchmark's sensors, which are exact without; the worlds' have their own
-)
+NOISE: Final = 0.01
+"""Of the benchmark's sensors, which are exact without; the worlds' have their own."""
 
 
 class SeasonSizes(NamedTuple):

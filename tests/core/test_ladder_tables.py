@@ -272,7 +272,12 @@ def test_strengths_of_ones_own_give_a_threshold_and_a_column_each():
     assert [row[1] for row in by_kind.rows] == ["0.224", "1"]
     assert by_kind.title.endswith("each in its own unit")
     assert "Means" not in by_kind.note
-    assert rows_of(table_of(records, "rf: detection", places=True))["tank"]["gravity"] == "0.224"
+    # Of one environment there is no more to say.
+    titles = [t.title for t in StrengthTables(Board(records)).overview(places=True)]
+    assert not any(title.startswith("rf: detection") for title in titles)
+    pool = own("rf", (0, 0, 1, 1), environment="pool")
+    table = table_of([*records, *pool], "rf: detection", places=True)
+    assert rows_of(table)["tank"]["gravity"] == "0.224"
 
 
 def test_thresholds_without_a_common_scale_have_no_mean_but_relative_to_a_reference():

@@ -10,10 +10,11 @@ from rich.console import Console
 
 pytest.importorskip("gymnasium")
 
-from oodd_recording import build, calibrate, commands
+from oodd_recording import build, calibrate
 from oodd_recording.build import build_split
 from oodd_recording.values import bound_of, unit_of
 
+from oodd_eval.cli import progress
 from oodd_eval.cli.main import main
 from oodd_eval.data import condition
 from oodd_eval.data.condition import (
@@ -241,9 +242,9 @@ def test_a_calibration_shows_a_bar_or_now_and_then_a_line(monkeypatch):
     def shown(*, terminal, quiet=False, silence=0.0):
         file = io.StringIO()
         console = Console(file=file, force_terminal=terminal, width=80, quiet=quiet)
-        monkeypatch.setattr(commands, "make_console", lambda **_: console)
-        monkeypatch.setattr(commands, "SILENCE", silence)
-        with commands._shown("evaluations", quiet=quiet) as show:
+        monkeypatch.setattr(progress, "make_console", lambda **_: console)
+        monkeypatch.setattr(progress, "SILENCE", silence)
+        with progress.pace_shown("evaluations", quiet=quiet) as show:
             show(2, 9, "")
             show(3, 8, "hopper iid")
         return file.getvalue()

@@ -447,8 +447,8 @@ from oodd_eval.data.registry import register
 from {package} import oodd_anomalies, oodd_environments
 register([*oodd_environments(), *oodd_anomalies()])
 from oodd_recording.policies import load_policy
-from oodd_recording.closed_loop import record_nominal
-record_nominal("{environment}", 1, policy=load_policy("{environment}"), episode_cap=60)
+from oodd_recording.closed_loop import Setup
+Setup("{environment}", load_policy("{environment}"), 60).record(1)
 others = {{"pybullet", "pybullet_envs_gymnasium", "Box2D", "mujoco"}} & set(sys.modules)
 sys.exit(f"imported {{others}}" if others else 0)
 """

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers_simulate import Reflex, record
 from oodd_recording import closed_loop as recording
-from oodd_recording.closed_loop import TwinTooShortError, record_nominal
+from oodd_recording.closed_loop import Setup, TwinTooShortError
 from oodd_recording.environments import make
 from oodd_recording.faults import Fault
 
@@ -42,11 +42,11 @@ def test_every_part_of_128_bits_reaches_the_simulator_and_the_anomaly(environmen
 
 
 def test_the_cap_ends_an_episode_without_terminating_it():
-    capped = record_nominal("halfcheetah", 1, policy=Reflex("halfcheetah"), episode_cap=40)
+    capped = Setup("halfcheetah", Reflex("halfcheetah"), 40).record(1)
     assert (capped.trajectory.transitions, capped.terminated) == (40, False)
-    longer = record_nominal("halfcheetah", 1, policy=Reflex("halfcheetah"), episode_cap=60)
+    longer = Setup("halfcheetah", Reflex("halfcheetah"), 60).record(1)
     assert (longer.trajectory.observations[:41] == capped.trajectory.observations).all()
-    fallen = record_nominal("cartpole", 1, policy=_Right())
+    fallen = Setup("cartpole", _Right()).record(1)
     assert fallen.terminated
     assert fallen.trajectory.transitions < 50
     with pytest.raises(TwinTooShortError, match=r"cartpole with seed 1 .* at least 50"):
@@ -92,7 +92,9 @@ def scripted(monkeypatch, script):
         if effect is not None:
             rows[effect:, 1] = 1
         actions = np.eye(2, dtype=np.float32)[[0] * length]
-        return rows, actions, np.zeros(length, "f4"), True, {"attempt": len(attempts) - 1}
+        drawn = {"attempt": len(attempts) - 1}
+        episode = Trajectory(rows, actions), np.zeros(length, "f4"), True, seed
+        return recording.RecordedEpisode(*episode, parameters=drawn)
 
     def generator(environment, anomaly, seed, attempt):
         attempts.append(attempt)

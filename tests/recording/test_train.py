@@ -128,19 +128,8 @@ class Leftward:
         return 0
 
 
-def test_freezing_adds_the_evaluation_to_the_provenance(tmp_path):
-    trained = train.train_policy("cartpole", out=tmp_path / "run", steps=40)
-    found = freeze.freeze_trained("cartpole", trained, episodes=3, directory=tmp_path / "frozen")
-    facts = json.loads((tmp_path / "frozen" / "cartpole.json").read_text())
-    assert facts["mean_return"] == found.mean()
-    assert facts["std_return"] == found.std()
-    assert facts["episodes"] == 3
-    assert facts["share_of_paper"] == found.mean() / 500
-    assert not facts["finished"]
-    assert facts["flagged"]
-    frozen = load_policy("cartpole", tmp_path / "frozen" / "cartpole.npz")
-    assert frozen.digest == facts["digest"] == load_policy("cartpole", trained).digest
-    # Each seed gives one return; pushed one way all the time, CartPole falls after 8 to 11 steps.
+def test_each_seed_gives_one_return():
+    # Pushed one way all the time, CartPole falls after 8 to 11 steps.
     found = record.evaluate_policy("cartpole", Leftward(), episodes=4, seed=7)
     later = record.evaluate_policy("cartpole", Leftward(), episodes=2, seed=9)
     assert found.shape == (4,)

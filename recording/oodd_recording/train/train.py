@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from oodd_eval.data.files import replacing, write_text
 from oodd_eval.errors import MissingExtraError, PolicyError
@@ -17,6 +16,9 @@ from oodd_recording.closed_loop import evaluate_policy
 from oodd_recording.policies import load_policy
 from oodd_recording.registered import info_of
 from oodd_recording.train.freeze import freeze_policy
+
+if TYPE_CHECKING:
+    from oodd_recording.train import iqn, td3  # need torch
 
 SELECTION_SEED: Final = 910_000_000
 """First seed of the episodes by which a training picks its best actor."""
@@ -38,26 +40,8 @@ OTHER_STEPS: Final = 200_000  # of an environment of one's own
 Progress = Callable[[str], None]
 
 
-class Learner(Protocol):
-    """An algorithm that trains a policy of one environment."""
-
-    hyper_parameters: dict[str, Any]
-
-    def state(self) -> dict[str, Any]:
-        """Return networks and optimisers for a checkpoint."""
-        ...
-
-    def load(self, state: dict[str, Any]) -> None:
-        """Take over the state of a checkpoint."""
-        ...
-
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return the weights of the actor as a policy file holds them."""
-        ...
-
-    def run(self, seed: int, start: int, steps: int) -> Iterator[int]:
-        """Train from one step to another; yield the step whenever an evaluation is due."""
-        ...
+Learner: TypeAlias = "td3.TD3 | iqn.IQN"
+"""An algorithm that trains a policy of one environment."""
 
 
 def train_policy(
