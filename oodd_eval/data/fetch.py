@@ -373,8 +373,5 @@ def _copy(content: Any, target: Path, most: int, name: str, *, have: int = 0) ->
                 raise SplitError(f"{name} has more than the {most} bytes that it may have: refused")
             if shutil.disk_usage(target.parent).free < len(block) + SPARE_BYTES:
                 target.unlink()
-                raise OutputError(
-                    f"{name} would leave less than {SPARE_BYTES} bytes of the disk free: make "
-                    "room, or name another disk with --output"
-                )
+                raise OutputError(f"{name} would leave less than {SPARE_BYTES} bytes of disk free")
             out.write(block)

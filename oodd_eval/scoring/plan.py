@@ -201,8 +201,7 @@ def make_plan(
     )
     notes += tuple(f"{name} is left out: {r}" for name, rs in lacking.items() for r in rs)
     notes += tuple(
-        f"{name} reads actions and is given none: its DetectorSpec has to declare them, by "
-        'inputs="observations+actions"'
+        f'{name} reads actions and is given none: declare inputs="observations+actions" in its spec'
         for name in dict.fromkeys(unaware)
     )
     return Plan(split.name, split.digest, tuple(units), split.groups, limit, strengths, notes)

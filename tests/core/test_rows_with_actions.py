@@ -120,8 +120,7 @@ def test_a_detector_that_reads_actions_and_does_not_declare_them_is_named(monkey
     install(monkeypatch, tmp_path, "mine", READS)
     (note,) = plan_of(["mine", "declares", "rf", "mewma-a"]).notes
     assert note == (
-        "mine reads actions and is given none: its DetectorSpec has to declare them, by "
-        'inputs="observations+actions"'
+        'mine reads actions and is given none: declare inputs="observations+actions" in its spec'
     )
 
 

@@ -305,7 +305,7 @@ def test_a_download_without_end_is_given_up(tiny_split, home, web, monkeypatch):
 def test_a_fetch_leaves_some_of_the_disk_free(tiny_split, home, monkeypatch):
     free = shutil.disk_usage(tiny_split).free
     monkeypatch.setattr(fetching, "SPARE_BYTES", 2 * free)
-    with pytest.raises(OutputError, match=r"would leave less than \d+ bytes of the disk free"):
+    with pytest.raises(OutputError, match=r"would leave less than \d+ bytes of disk free"):
         fetch(str(tiny_split))
     assert not list(home.rglob("*.h5*"))
 
