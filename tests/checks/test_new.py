@@ -55,6 +55,14 @@ def test_a_name_that_is_taken_is_refused(name, taken, tmp_path, capsys, monkeypa
     assert not (tmp_path / "new").exists()
 
 
+@pytest.mark.parametrize("name", ["hopper", "tank", "payload"])
+def test_the_name_of_an_environment_is_taken_from_another(name, tmp_path, capsys):
+    output = ["--output", str(tmp_path / "new")]
+    assert main(["new", name, "--environment", *output]) == 4
+    assert f"there is an environment or kind of anomaly {name!r} already" in capsys.readouterr().err
+    assert main(["new", name, *output]) == 0
+
+
 def test_a_directory_in_use_is_left_alone(tmp_path):
     (tmp_path / "mine.txt").write_text("kept")
     with pytest.raises(OutputError, match="exists and is not an empty directory"):

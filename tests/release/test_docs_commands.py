@@ -59,11 +59,10 @@ KNOWN = {
     },
     "docs/metrics.md": {"before": ["oodd-eval run --detector rf --env cartpole --limit 2"]},
     "docs/regression-checks.md": {
-        "before": [PERSISTENCE],
         "rules": {
-            r"--detector rf\b": "--detector persistence",
+            r"--detector (rf|mine)\b": "--detector persistence",
             r"--oodd-detector mine": "--oodd-detector persistence",
-        },
+        }
     },
     "docs/how-to/evaluate.md": {
         "files": {"hopper.toml": "```toml"},
@@ -90,7 +89,10 @@ KNOWN = {
         }
     },
     "docs/how-to/own-environment.md": {
-        "files": {"oodd_pendulum.py": "```python", "pyproject.toml": "```toml"}
+        "rules": {
+            r"^pytest oodd-two-link": "oodd-eval check two-link",
+            r"mewma,persistence": "persistence",
+        }
     },
     "docs/how-to/interventions.md": {
         "files": {"oodd_swing.py": "```python", "pyproject.toml": "```toml"}
@@ -233,7 +235,6 @@ FRAGMENTS = {
     "docs/board-data.md": "test_the_documents_program_reads_the_table builds a board for it",
     "examples/oodd-go1/README.md": "needs episodes of a robot that others published",
     "examples/oodd-inspect-robots/README.md": "test_inspect_robots runs it, and reads its figures",
-    "docs/tutorial.md": "a piece of the test file that `new` writes, which test_new runs",
     "detectors/README.md": "the plug-in that the commands of the page run",
 }
 

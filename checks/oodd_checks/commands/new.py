@@ -49,7 +49,7 @@ def new(options: Options) -> int:
     """
     project = Project(options.name, options.environment)
     if taken := _taken(project, discover(options.disabled)):
-        raise UsageError(f"there is a {taken}: choose another name, such as 'my-{project.name}'")
+        raise UsageError(f"there is {taken}: choose another name, such as 'my-{project.name}'")
     directory = options.output or Path(project.distribution)
     written = write_project(project, directory)
     if options.verbosity >= 0:
@@ -66,11 +66,12 @@ def new(options: Options) -> int:
 def _taken(project: Project, plugins: Plugins) -> str:
     """Return what has the project's name already; empty if nothing has."""
     if offer := plugins.offers.get(project.name):
-        return f"detector {project.name!r} already, of {offer.origin}"
+        return f"a detector {project.name!r} already, of {offer.origin}"
     if project.name in plugins.names:
-        return f"plug-in {project.name!r} already"
+        return f"a plug-in {project.name!r} already"
     if find_spec(project.module):
-        return f"module {project.module!r} already"
-    if project.environment and project.name in {*ENVIRONMENTS, *plugins.custom_specs}:
-        return f"environment or kind of anomaly {project.name!r} already"
+        return f"a module {project.module!r} already"
+    named = {*ENVIRONMENTS, *(spec.name for spec in plugins.custom_specs.specs)}
+    if project.environment and project.name in named:
+        return f"an environment or kind of anomaly {project.name!r} already"
     return ""
