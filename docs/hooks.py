@@ -45,7 +45,8 @@ ELSEWHERE = (
 """Files outside docs/ that are part of the site, under the same paths."""
 
 BOARD = "leaderboard/site"
-RESULTS = ("leaderboard/README.md", f"{BOARD}/index.html")
+SITE = "site/index.html"
+RESULTS = ("leaderboard/README.md", f"leaderboard/{SITE}")
 """Pages of the leaderboard; absent before the first entry."""
 
 FENCE = re.compile(r"^(```.*?^```[^\n]*$)", re.MULTILINE | re.DOTALL)
@@ -54,6 +55,8 @@ MATHS = re.compile(r"^\$\$(.+?)\$\$$", re.MULTILINE | re.DOTALL)
 NUMBER = re.compile(r"(?<![^\s>-])(?=[^\s<-]*\d)[^\sA-Za-z<>-]+(?![^\s<-])")
 """A word with digits and without letters, where the search splits its index."""
 COMMANDS = "<!-- help of every command -->"
+WORD = re.compile(r"<code>([^<\s]{1,24})</code>")
+"""A short name as code, which a line should not break at its hyphens."""
 PARAGRAPH = re.compile(r"<p>(.*?)</p>", re.DOTALL)
 SENTENCES = re.compile(r"(?<=[.?!]) ")
 
@@ -110,8 +113,9 @@ def on_nav(nav: Navigation, config: ProperDocsConfig, files: Files) -> Navigatio
 
 
 def on_page_content(content: str, page: Page, config: ProperDocsConfig, files: Files) -> str:
-    """Describe a page by its first sentence, or by more of them where the first is short."""
+    """Describe a page by its first sentences, and keep names such as ``pe-a`` on one line."""
     del config, files
+    content = WORD.sub(r'<code class="word">\1</code>', content)
     texts = (_plain(paragraph) for paragraph in PARAGRAPH.findall(content))
     first, *others = SENTENCES.split(next((text for text in texts if text.count(" ") > 2), ""))
     while others and len(first) < 50:
@@ -171,8 +175,9 @@ def board() -> dict[str, str | bytes]:
         return {}
     board = read_leaderboard(ROOT / "leaderboard")
     # Pages of Markdown that it links to are pages of this site.
-    pages = {"home": "../../index.html", "submit": "../../submitting.html"}
-    links = {**pages, "source": repository()}
+    pages = {"home": "index", "submit": "submitting", "cite": "cite"}
+    links = {name: f"../../{page}.html" for name, page in pages.items()}
+    links["source"] = repository()
     shown = site.files(board.reported, board.suites, board.seasons, links=links)
     page = shown[site.PAGE].replace('href="../README.md"', 'href="../index.html"')
     files = {**shown, site.PAGE: page, Path(CELLS).name: cells(board)}
@@ -196,7 +201,9 @@ def on_page_markdown(markdown: str, page: Page, config: ProperDocsConfig, files:
 
     parts = FENCE.split(markdown)
     parts[::2] = map(outside_of_code, parts[::2])
-    return "".join(parts).replace(COMMANDS, _commands() if COMMANDS in markdown else "")
+    text = "".join(parts).replace(COMMANDS, _commands() if COMMANDS in markdown else "")
+    # The board's page is also read where its site is not built, so that it has no link itself.
+    return text.replace(f"`{SITE}`", f"[{SITE}]({SITE})") if source == RESULTS[0] else text
 
 
 def _link(found: re.Match[str], source: str, uri: str, pages: dict[str, str]) -> str:

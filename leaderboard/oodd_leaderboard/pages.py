@@ -233,9 +233,10 @@ def _board(
 ) -> str:
     """Return a board's part of the page: its rows, whose they are, failures, notes."""
     front = board_table(ranks)
+    counted = tables.findings(ranks.board)  # a place in the table says the same
     body = Section(
         title,
-        findings=findings_of(ranks.board),
+        findings=[sentence for sentence in findings_of(ranks.board) if sentence not in counted],
         tables=[t for t in (_authors(ranks, entries), tables.failures(ranks.board)) if t],
         notes=[*unranked(ranks), *tables.notes(ranks.board)],
     )

@@ -28,7 +28,8 @@ from oodd_eval.metrics.catalogue import METRICS, metric_info
 
 STATIC = Path(site.__file__).parent / "static"
 
-LINKS = {"home": "../../README.md", "submit": "../../docs/submitting.md", "source": "../../."}
+LINKS = {"home": "../../README.md", "submit": "../../docs/submitting.md",
+         "cite": "../../docs/cite.md", "source": "../../."}  # fmt: skip
 
 EVIL = "</script><script>alert(1)</script><!-- <b> & \u2028 @style@"
 
@@ -75,7 +76,7 @@ def test_every_page_leads_home_to_the_board_to_submitting_and_to_the_source(page
     (line,) = re.findall(r'<nav class="site" aria-label="Site">(.*?)</nav>', page, re.DOTALL)
     links = re.findall('href="([^"]*)">([^<]*)<', line)
     assert links == [(LINKS["home"], "Home"), ("#/", "Board"), (LINKS["submit"], "Submit"),
-                     (LINKS["source"], "Source")]  # fmt: skip
+                     (LINKS["cite"], "Cite"), (LINKS["source"], "Source")]  # fmt: skip
 
 
 def test_links_lead_to_the_checkout_that_a_site_is_in(tmp_path, monkeypatch):

@@ -1,17 +1,21 @@
 """The site in a real browser, opened from disk: its first view, filters, keyboard, a row's page."""
 
 import itertools
+import shlex
 import time
 import urllib.parse
 
 import helpers_site
 import pytest
 from helpers_docs import ROOT
+from helpers_records import make_record
 from oodd_leaderboard import site
 from oodd_leaderboard.curve_file import read_curves
 from oodd_leaderboard.reported import REPORTED, Reported, sections
 
+from oodd_eval.cli.main import main
 from oodd_eval.data.facts import ANOMALIES
+from oodd_eval.data.split import published_digests
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.results.tables import show_value
 
@@ -109,7 +113,7 @@ def test_the_first_view_names_the_best_row_whose_it_is_when_and_how_to_take_part
         headline
     )
     assert f"[{100 * test.low:+.1f}, {100 * test.high:+.1f}]" in headline
-    assert browser.texts("header nav a") == ["Home", "Board", "Submit", "Source"]
+    assert browser.texts("header nav a") == ["Home", "Board", "Submit", "Cite", "Source"]
     assert browser.texts("#boards label") == [
         "Season 2026-11", "Reported: mini (abababab)", "Reported: mini (cdcdcdcd)",
     ]  # fmt: skip
@@ -260,6 +264,7 @@ def test_search_finds_names_authors_and_papers(browser):
     assert search("RIQ") == ["riqn"]
     assert search("eve") == ["mine", "rf"]
     assert search("benchmarks") == ["riqn"]
+    assert search("the paper\N{RIGHT SINGLE QUOTATION MARK}s") == ["riqn"]
     assert search("no such") == []
 
 
@@ -466,7 +471,7 @@ def test_every_page_can_be_read_at_every_width_and_in_every_colour(browser, url,
         for view in VIEWS:
             open_view(browser, url, view.replace("BOARD", boards[1]["id"]))
             assert browser.run(THEME) == theme
-            assert browser.texts("header nav a") == ["Home", "Board", "Submit", "Source"]
+            assert browser.texts("header nav a") == ["Home", "Board", "Submit", "Cite", "Source"]
             if lines := browser.defects(width) + browser.run(NAMELESS):
                 defects[view] = lines
             browser.open(url)  # so that the next view finds the rows
@@ -541,6 +546,26 @@ def test_reported_logs_have_columns_of_their_own_and_no_twins(window, tmp_path, 
     assert titles[:2] == ["Detector", "Pooled AUC"]
     assert titles[-3:] == FIVE[2:]
     assert window.console() == []
+
+
+def test_a_row_of_a_published_split_says_which_command_makes_it(window, tmp_path):
+    digest = published_digests()["mini"]
+    records = [make_record("riqn", seed=seed, overrides={"members": 5}, digest=digest)
+               for seed in (0, 1)]  # fmt: skip
+    other = [make_record("rf", digest="ab" * 32)]
+    reported = sections([Reported(tmp_path, records), Reported(tmp_path / "other", other)])
+    window.open(written(tmp_path, reported))
+    open_row(window, "riqn[members=5]")
+    (command,) = window.texts("#source code")
+    assert command == (
+        "oodd-eval run --detector riqn --env hopper --split mini --seed 0,1 --param members=5"
+    )
+    assert main([*shlex.split(command)[1:], "--collect-only"]) == 0
+    window.run("history.back()")
+    window.wait_for("document.querySelector('#detector').hidden")
+    choose_board(window, "Reported: mini (abababab)")
+    open_row(window, "rf")
+    assert window.texts("#source code") == []  # others have no such split
 
 
 def test_a_page_without_entries_says_so(window, tmp_path):

@@ -41,6 +41,7 @@ SCRIPTS: Final = (
 LINKS: Final = {
     "home": ("Home", "README.md"),
     "submit": ("Submit", "docs/submitting.md"),
+    "cite": ("Cite", "docs/cite.md"),
     "source": ("Source", "."),
 }
 """Titles of the links that every page has beside the board, and where they lead in a checkout."""
@@ -112,9 +113,9 @@ def index(data: Json, season: str = "", links: Mapping[str, str] = MappingProxyT
 
 
 def _anchors(addresses: Mapping[str, str]) -> list[str]:
-    """Return the links that every page has: home, the board, how to submit, the source."""
-    anchors = {name: (title, addresses.get(name, "")) for name, (title, _) in LINKS.items()}
-    ordered = [anchors["home"], ("Board", "#/"), anchors["submit"], anchors["source"]]
+    """Return the links that every page has: home, the board, then the others."""
+    home, *others = ((title, addresses.get(name, "")) for name, (title, _) in LINKS.items())
+    ordered = [home, ("Board", "#/"), *others]
     return [f'<a href="{escape(to)}">{title}</a>' for title, to in ordered if to]
 
 

@@ -7,8 +7,10 @@ sorts and draws.
 """
 
 import hashlib
+import json
 import math
 import re
+import shlex
 import statistics
 from calendar import month_name
 from collections import Counter
@@ -23,7 +25,7 @@ from numpy.typing import NDArray
 
 from oodd_eval.data.facts import ANOMALIES, GROUPS, Quantity, paper_tables, title_of
 from oodd_eval.data.parts import EnvironmentData
-from oodd_eval.data.split import SHIPPED, Split
+from oodd_eval.data.split import SHIPPED, Split, published_digests
 from oodd_eval.metrics.bootstrap import nan_mean
 from oodd_eval.metrics.catalogue import HEADLINE, METRICS, NAMES, RANKING, metric_info
 from oodd_eval.metrics.cusum import DRIFT, THRESHOLD
@@ -326,6 +328,7 @@ def _row(
     part = {
         "version": records[0].detector_version,
         "parameters": records[0].parameters,
+        "command": _command(row, board, line["seeds"]),
         "entry": _fields(entry, *ENTRY_FIELDS)
         | {"requirement": entry.wheel or entry.requirement, "reported": source and source.name},
         "values": [[_mean(of_cell, name) for of_cell in complete_cells] for name in names],
@@ -333,6 +336,19 @@ def _row(
         "curves": _curves(units.get(source.name, []) if source else [], records),
     }
     return line, part
+
+
+def _command(row: Setting, board: Board, seeds: Sequence[int]) -> str:
+    """Return the command that makes a row's records; nothing where others have not the split."""
+    if published_digests().get(board.split) != board.digest:
+        return ""
+    words = ["--detector", row.detector, "--env", ",".join(board.environments)]
+    words += ["--split", board.split, "--seed", ",".join(map(str, seeds))]
+    words += ["--horizon", str(row.horizon)] * (row.horizon != 1)
+    words += ["--limit", str(board.limit)] * (board.limit is not None)
+    for name, value in row.overrides.items():
+        words += ["--param", f"{name}={value if isinstance(value, str) else json.dumps(value)}"]
+    return shlex.join(["oodd-eval", "run", *words])
 
 
 def _difference(test: PairedDifference | None) -> Json | None:

@@ -214,7 +214,7 @@ function metricsTable(board, row) {
 /** What is known of where a row is from. Only http addresses become links. */
 function facts(board, row) {
   const text = (value) => typeof value === "string" ? value : JSON.stringify(value);
-  const { entry, version, parameters } = PARTS.get(row.part);
+  const { entry, version, parameters, command } = PARTS.get(row.part);
   const wheels = board.season?.installed[row.detector] ?? [];
   const bibtex = bibtexOf(row);
   return element("dl", { class: "facts" }, [
@@ -223,7 +223,7 @@ function facts(board, row) {
     ["Seeds", row.seeds.join(", ")],
     ["Installed", entry.requirement], ["SHA-256", entry.sha256],
     ["With", wheels.map(({ distribution, version: of, sha256 }) => element("div", {}, `${distribution} ${of}, SHA-256 ${sha256.slice(0, 12)}`))],
-    ["Reported in", entry.reported],
+    ["Reported in", entry.reported], ["Run it", command && element("code", { class: "bibtex" }, command)],
     ["Authors", entry.authors], ["Paper", entry.paper], ["Year", entry.year && String(entry.year)], ["Licence", entry.licence],
     ["Address", linkTo(entry.url, entry.url)],
     ["Citation", bibtex && element("div", {}, element("pre", { class: "bibtex" }, bibtex),

@@ -162,7 +162,7 @@ function once(of) {
 /** Rows that the search leaves, sorted by a column; what has no value stays last. */
 function rowsOf(board, columns) {
   const sought = state.search.trim().toLowerCase();
-  const rows = board.rows.filter((row) => !sought || [row.label, row.plugin, row.authors, row.paper].some((text) => text.toLowerCase().includes(sought)));
+  const rows = board.rows.filter((row) => !sought || [row.label, row.plugin, row.authors, row.paper, String(row.year ?? ""), ORIGINS[row.origin]?.[0] ?? ""].some((text) => text.toLowerCase().includes(sought)));
   const sign = state.ascending ? 1 : -1;
   const label = (a, b) => a.label < b.label ? -1 : Number(a.label > b.label);
   if (state.sort === "label") return rows.sort((a, b) => sign * label(a, b));
