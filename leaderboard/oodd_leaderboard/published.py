@@ -248,7 +248,13 @@ def board_table(ranks: OrderedBoard, marked: Collection[Setting] = ()) -> Table 
     for row in ranks.standings:
         named = [printed_name(row, marked), _whose(row)]
         labels[row.entry] = [row.printed_rank, *named] if placed else named
-    return Tables(ranks.board, labels=labels, label_names=header).headline()
+    table = Tables(ranks.board, labels=labels, label_names=header).headline()
+    if table is None:
+        return None
+    short = table.narrower[-1] if table.narrower else table
+    columns = [i for i, name in enumerate(short.header) if name != header[-1]]
+    without = replace(short.columns(columns), labels=len(header) - 1)
+    return replace(table, narrower=[*table.narrower, without])
 
 
 def printed_name(row: Standing, marked: Collection[Setting] = ()) -> str:

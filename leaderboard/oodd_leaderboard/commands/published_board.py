@@ -131,7 +131,7 @@ def _nearby(table: Table) -> Table:
         left_out = [""] * len(table.header)
         left_out[column] = f"({counted(len(rows), 'more row(s)')})"
         lines += rows if close else [left_out]
-    return replace(table, rows=lines)
+    return replace(table, rows=lines, narrower=[*map(_nearby, table.narrower)])
 
 
 def _sentences(placed: Placement) -> list[str]:
