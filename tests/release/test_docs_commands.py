@@ -91,6 +91,8 @@ KNOWN = {
     "docs/how-to/own-environment.md": {
         "rules": {
             r"^pytest oodd-two-link": "oodd-eval check two-link",
+            # test_trial_environment calibrates.
+            r"--suite ladder": "--strength weak-motor=0.5",
             r"mewma,persistence": "persistence",
         }
     },
