@@ -253,9 +253,9 @@ def own_row(board: Board) -> Setting:
 def verdict_of(board: Board, level: str = "") -> str:
     """Return the sentence that comes first: where the reader's own row stands, see `own_row`.
 
-    It is compared with the first row of the table, or the second where it is the first. Rows that
-    know more than nominal trajectories are passed over, and those that learn from failures are
-    compared with one another alone.
+    It is compared with the row above it, or the second where it is the first. Rows that know more
+    than nominal trajectories are passed over, and those that learn from failures are compared with
+    one another alone.
 
     Parameters
     ----------
@@ -280,7 +280,7 @@ def verdict_of(board: Board, level: str = "") -> str:
     if len(band) == 1:
         return _in_words(board, mine, level or board.level)
     i, n = band.index(mine), len(band)
-    rival = band[0] if i else band[1]
+    rival = band[i - 1] if i else band[1]
     many = f"number {i + 1} of {n}"
     rank = f"{mine} is {many if n > len(_PLACES) else f'{_PLACES[i]} of {_NUMBERS[n - 1]}'}"
     if len(board.entries) > n:

@@ -407,10 +407,10 @@ def test_the_verdict_says_where_the_first_row_that_was_named_stands():
     ahead = "rf is first of three, 10.0 points [10.0, 10.0] ahead of mewma in matched AUC."
     assert verdict_of(Board([records[1], records[0], records[2]])) == ahead
     last = verdict_of(Board(records[::-1]))
-    assert last.startswith("clock is third of three, 15.5 points [")
-    assert last.endswith("] behind rf in matched AUC.")
+    assert last.startswith("clock is third of three, 5.5 points [")
+    assert last.endswith("] behind mewma in matched AUC.")
     many = [make_record(f"row{i:02}", values={"auc_matched": [i / 20] * 12}) for i in range(13)]
-    assert verdict_of(Board(many)).startswith("row00 is number 13 of 13, 60.0 points [")
+    assert verdict_of(Board(many)).startswith("row00 is number 13 of 13, 5.0 points [")
 
 
 @pytest.mark.parametrize("plugin", ["mine:mine", "local:", "oodd-eval:adapters"])
@@ -508,8 +508,8 @@ def test_rows_that_failed_or_know_more_than_nominal_episodes_are_no_rivals():
     # One that lacks a cell is compared over what both have, and said to be.
     more = [*rows(**values), *(r for d in values for r in [make_record(d, "ant", values=FLAT)])]
     text = verdict_of(Board([*more, own("jumps", values={"auc_matched": [0.9] * 12})]))
-    assert text.startswith("jumps is third of three, 30.0 points [")
-    assert text.endswith("] ahead of rf in matched AUC, over the 1 cell that both have.")
+    assert text.startswith("jumps is third of three, 40.0 points [")
+    assert text.endswith("] ahead of mewma in matched AUC, over the 1 cell that both have.")
 
 
 FLAT = {"auc_matched": [0.5] * 12}
