@@ -40,6 +40,7 @@ ELSEWHERE = (
     "leaderboard/reproduction/*/figures/*",
     "leaderboard/reproduction/*/*.csv",
     "leaderboard/reproduction/*/tables/*.csv",
+    "leaderboard/tables/*.csv",
     "recording/README.md",
 )
 """Files outside docs/ that are part of the site, under the same paths."""
