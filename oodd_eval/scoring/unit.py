@@ -87,26 +87,21 @@ class UnitJob:
 
         `progress` hears which share of the fit is done, in the thread that calls.
         """
-        if self.unit.local:
-            return self._in_process(progress)
+        local = self.unit.local
         try:
+            if local:
+                return GroupedScoring(self, progress).in_process()
             return self._isolated(limits, stop, results, progress, fresh=fresh)
-        except (SplitError, OutputError, ResultsError, UsageError):
-            raise
-        except Exception as error:  # noqa: BLE001  a plug-in that nobody thought of is one unit's
-            return Scored("error", f"oodd-eval: {describe(error)}", log=traceback.format_exc())
-
-    def _in_process(self, progress: Progress) -> Scored:
-        """Return the scores of a detector of this process; the sole one's errors are raised."""
-        try:
-            return GroupedScoring(self, progress).in_process()
         except (SplitError, OutputError, ResultsError):
             raise
         except Exception as error:
-            if len({unit.setting.detector for unit in self.plan.units}) == 1:
+            sole = len({unit.setting.detector for unit in self.plan.units}) == 1
+            if sole if local else isinstance(error, UsageError):
                 raise
+            # Of a worker it is a plug-in that nobody thought of.
+            reason = describe(error) if local else f"oodd-eval: {describe(error)}"
             status: Status = "invalid" if isinstance(error, ContractError) else "error"
-            return Scored(status, describe(error), log=traceback.format_exc())
+            return Scored(status, reason, log=traceback.format_exc())
 
     def _isolated(
         self,

@@ -112,13 +112,14 @@ def test_inputs(trial: Trial) -> None:
     if trial.actions or spec.with_actions:
         pytest.skip("declares actions, or a detector that takes its place where there are any")
     trial.fitted()
-    settings = {"horizon": trial.horizon, "seed": trial.seed, "parameters": trial.parameters}
-    shown = Trial(replace(spec, inputs="observations+actions"), **settings)
-    if isinstance(shown.first_fit, AssertionError):
+    seed, parameters = trial.seed, trial.parameters
+    spec = replace(spec, inputs="observations+actions")
+    with_actions = Trial(spec, horizon=trial.horizon, seed=seed, parameters=parameters)
+    if isinstance(with_actions.first_fit, AssertionError):
         return  # It takes no episodes with actions, so that it does not read them in silence.
-    for bare, full in zip(trial.nominal(2), shown.nominal(2), strict=True):
+    for bare, full in zip(trial.nominal(2), with_actions.nominal(2), strict=True):
         assert_equal(
-            shown.scores(full),
+            with_actions.scores(full),
             trial.scores(bare),
             "it reads actions, which its spec does not declare, so that a run hands it actions of "
             "width 0; shown actions, its scores differ",
