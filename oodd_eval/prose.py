@@ -149,9 +149,9 @@ def _lines_of(table: Table) -> list[str]:
 def _fitting(table: Table, width: int) -> list[Table]:
     """Return what of a table fits: its first shape that does, or parts of its columns."""
     shapes = [table, *table.narrower]
-    if table.whole:  # intervals lose their spaces, and then one after the other goes
-        last, columns = shapes[-1], range(table.labels, len(shapes[-1].header))
-        shapes.append(_cut(last, table.labels, r"(\[\S+), ", r"\1,"))
+    if table.whole:  # intervals lose their spaces, and at last one after the other goes
+        last, columns = shapes[-1], range(shapes[-1].labels, len(shapes[-1].header))
+        shapes = [s for t in shapes for s in (t, _cut(t, t.labels, r"(\[\S+), ", r"\1,"))]
         shapes += [_cut(last, i, r" \[[^\]]*\]", "") for i in reversed(columns)]
     for shape in itertools.chain(*((shape, _wrapped(shape, width)) for shape in shapes)):
         if len(_lines_of(shape)[0]) <= width:

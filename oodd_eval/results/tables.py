@@ -186,7 +186,11 @@ class Tables:
         one_each = [] if several or not 1 < len(places) <= len(TABLE1) else places
         note = "\n".join(self._essentials(first, places, alarms)[:MOST_NOTES])
         wide, short = (
-            replace(self.table(title[0].upper() + title[1:], columns), note=note, whole=True)
+            replace(
+                self.table(title[0].upper() + title[1:], columns),
+                note=note,
+                whole=not self.intervals,
+            )
             for columns in ([*first, *one_each, *alarms], [*first, *alarms])
         )
         if first and len(places) > 1:

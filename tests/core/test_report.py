@@ -678,6 +678,12 @@ EIGHT = [*TABLE1]
         (five_columns(EIGHT, ["hopper"], ["mewma"]), 80, ["worst anomaly"], 2),
         (five_columns(["iid", "drift"], ["hopper"]), 80, ["iid", "drift"], 2),
         (five_columns(["iid"], ["hopper"]), 80, [], 2),
+        (
+            five_columns(["iid", "drift", "gravity"], ["hopper"], ["rf"]),
+            80,
+            ["iid", "drift", "gravity"],
+            2,
+        ),
     ],
 )
 def test_the_headline_is_one_table_whose_rows_are_detectors(records, width, columns, intervals):
@@ -701,6 +707,13 @@ def test_the_headline_is_one_table_whose_rows_are_detectors(records, width, colu
     rows = [line for line in lines[rule + 1 :] if line]
     assert [row.split()[0] for row in rows] == [str(s) for s in Board(records).entries]
     assert all(row.count("[") == intervals for row in rows)
+
+
+def test_intervals_that_are_asked_for_are_all_shown():
+    table = Tables(Board(five_columns()), intervals=True).headline()
+    lines = printed_table(table, 80)
+    assert max(map(len, lines)) <= 80
+    assert sum(line.count("[") for line in lines) == sum("[" in t for r in table.rows for t in r)
 
 
 def test_a_run_ends_with_one_table_and_at_most_three_notes():
