@@ -265,7 +265,7 @@ _RULE: Final = (
     "The threshold is the weakest strength that a detector finds within 100 rows in half of the "
     "episodes, where at most 5 % of nominal episodes have an alarm."
 )
-_FOUND: Final = (
+_SHARE: Final = (
     "Found is an episode with an alarm within 100 rows, where at most 5 % of nominal ones have one."
 )
 _BEYOND: Final = "≤ and > mark thresholds beyond the weakest and the strongest rung."
@@ -371,7 +371,7 @@ class StrengthTables:
         reference, unit = self.by_row.get(REFERENCE, {}), self._unit_of_mean
         names, shares = self._by_strength(order, DETECTION)
         title, header = "share of episodes found by strength (%)", ["detector", *names]
-        rows, note = [[str(entry), *shares[entry]] for entry in order], _FOUND
+        rows, note = [[str(entry), *shares[entry]] for entry in order], _SHARE
         if unit:
             means = {
                 e: _mean(by_pair, reference, self.strengths) for e, by_pair in self.by_row.items()
@@ -402,31 +402,31 @@ class StrengthTables:
         return Table(title, ["detector", *names], rows, note=self._columns_note)
 
     def by_kind(self, order: Sequence[Setting]) -> Table:
-        """Return thresholds by kind of anomaly, means over environments with a common scale."""
-        columns: dict[str, list[Pair]] = {}
+        """Return thresholds by kind of anomaly, with a common scale means over environments."""
         pairs = list(dict.fromkeys(pair for by_pair in self.by_row.values() for pair in by_pair))
-        scaled = self.strengths.scaled
-        for kind in self._kinds(pairs):
-            of_kind = [pair for pair in pairs if pair[1] == kind]
-            if scaled or kind in self.units or len(of_kind) == 1:
-                columns[kind if scaled else self._with_unit(kind)] = of_kind
-            else:  # the unit may differ from environment to environment
-                columns |= {f"{kind}, {title_of(pair[0])}": [pair] for pair in of_kind}
-        rows = []
-        for entry in order:
-            own = self.by_row[entry]
-            of_columns = ({p: own[p] for p in column if p in own} for column in columns.values())
-            means = (_mean(by_pair, {}, self.strengths) for by_pair in of_columns)
-            texts = (mean.text(interval=self.intervals) if mean else "" for mean in means)
-            rows.append([str(entry), *texts])
+        kinds, scaled = self._kinds(pairs), self.strengths.scaled
+        columns = {kind: [pair for pair in pairs if pair[1] == kind] for kind in kinds}
         over, note = "each in its own unit", _BEYOND
         if scaled:  # thresholds are multiples of the strength that is the unit
             over = f"in units of the strength that {COSTS[self.strengths.base]}"
-        if scaled or any(len(column) > 1 for column in columns.values()):
             note = (
                 "Means are geometric, over environments; a threshold beyond the ladder counts "
                 f"as its end. {_SIDES}"
             )
+        else:
+            several = len(self.board.environments) > 1
+            columns = {
+                self._with_unit(kind) + f", {title_of(pair[0])}" * several: [pair]
+                for kind, of_kind in columns.items()
+                for pair in of_kind
+            }
+        rows = []
+        for entry in order:
+            by_pair = self.by_row[entry]
+            of_columns = ({p: by_pair[p] for p in c if p in by_pair} for c in columns.values())
+            means = (_mean(of_column, {}, self.strengths) for of_column in of_columns)
+            texts = (mean.text(interval=self.intervals) if mean else "" for mean in means)
+            rows.append([str(entry), *texts])
         title = f"Detection thresholds by anomaly, {over}"
         return Table(title, ["detector", *columns], rows, note=f"{_RULE} {note}")
 

@@ -317,17 +317,12 @@ def test_thresholds_without_a_common_scale_have_no_mean_but_relative_to_a_refere
         assert math.isnan(Results(records).thresholds()[0]["kept99"]) == (not scaled)
 
 
-def test_a_kind_has_a_mean_over_environments_where_its_unit_is_the_same():
+def test_environments_without_a_common_scale_have_a_column_each():
     records = [*own("rf", (0, 1, 1, 1)), *own("rf", (0, 0, 1, 1), environment="pool")]
-    apart, together = (
-        StrengthTables(Board(records), units=units).overview()[0]
-        for units in ({}, {"gravity": "g"})
-    )
-    assert apart.header == ["detector", "gravity, tank", "gravity, pool"]
-    assert apart.rows == [["rf", "0.224", "0.707"]]
-    assert together.header == ["detector", "gravity (g)"]
-    assert together.rows == [["rf", "0.398"]]
-    assert "Means are geometric" in together.note
+    table = StrengthTables(Board(records), units={"gravity": "g"}).overview()[0]
+    assert table.header == ["detector", "gravity (g), tank", "gravity (g), pool"]
+    assert table.rows == [["rf", "0.224", "0.707"]]
+    assert "Means" not in table.note
 
 
 def test_the_number_of_a_record_counts_and_not_the_ladders_of_the_same_name():
