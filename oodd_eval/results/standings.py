@@ -288,7 +288,7 @@ def verdict_of(board: Board, level: str = "") -> str:
     means = [board.of(row, Column(metric)) for row in (mine, rival)]
     try:
         test = compare_rows([r for r in board.records if r.ok], str(mine), str(rival), metric)
-    except ResultsError:  # without a cell in common
+    except (ResultsError, UnknownNameError):  # without a cell in common, or without any
         if means[0].state:
             return f"{mine} has no place: {means[0].state}."
         return "" if math.isnan(means[0].value) else f"{rank}."

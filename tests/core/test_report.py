@@ -505,6 +505,11 @@ def test_rows_that_failed_or_know_more_than_nominal_episodes_are_no_rivals():
     theirs = own("jumps", status="error", reason="no mood")
     text = verdict_of(Board([*rows(**values), theirs, own("jumps", anomaly="drift")]))
     assert text == "jumps has no place: error."
+    assert verdict_of(Board([*rows(**values), theirs])) == "jumps has no place: error."
+    assert verdict_of(Board([failed, *rows(**values)])) == "pe has no place: timeout."
+    assert verdict_of(Board([failed, theirs])) == "jumps has no place: error."
+    alone = verdict_of(Board([rows(**values)[0], failed]))
+    assert alone == "mewma is first of two."
     # One that lacks a cell is compared over what both have, and said to be.
     more = [*rows(**values), *(r for d in values for r in [make_record(d, "ant", values=FLAT)])]
     text = verdict_of(Board([*more, own("jumps", values={"auc_matched": [0.9] * 12})]))

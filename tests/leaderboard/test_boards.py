@@ -152,7 +152,12 @@ def test_an_installation_without_a_board_says_so(tmp_path, monkeypatch, capsys):
     assert "has no published board" in capsys.readouterr().err
 
 
-def test_show_prints_the_last_season_or_a_table_of_reported_rows(shipped, capsys):
+def test_show_prints_the_last_season_or_a_table_of_reported_rows(shipped, capsys, monkeypatch):
+    assert main(["leaderboard", "show"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert not any("the paper, 2021" in line for line in lines)  # a column that goes first
+    monkeypatch.setenv("COLUMNS", "140")
     assert main(["leaderboard", "show"]) == 0
     text = " ".join(capsys.readouterr().out.split())
     assert text.startswith("Season 2026-11, 2026-11-27 Best: riqn by Danesh")
