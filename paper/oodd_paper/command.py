@@ -116,9 +116,9 @@ def _run(options: Options) -> int:
     split = _split(options)
     refuse_inputs(options.output, [split.path], "--output")
     tier, definition = TIERS[options.tier], split.manifest["definition"]
-    sizes = {part: int(definition[part]) for part in ("train", "calibration", "test")}
+    train, calibration, test = (int(definition[p]) for p in ("train", "calibration", "test"))
     units = len(lay_out(EXPERIMENTS, tier, split, plugins))
-    header = Reproduction(tier, split.name, split.digest, PROTOCOL, **sizes, units=units)
+    header = Reproduction(tier, split.name, split.digest, PROTOCOL, train, calibration, test, units)
     selected = lay_out(experiments, tier, split, plugins, options.device)
     header.check_same_data(directory)
     here = results.records() if (directory / RECORDS).exists() and not options.fresh else []
