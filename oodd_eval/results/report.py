@@ -146,12 +146,12 @@ def _in_order(board: Board) -> Board:
 
 
 def _narrowing(table: Table) -> Table:
-    """Return a table of strengths that leaves out columns where it is too wide, never parted."""
-    last = range(5, len(table.header) + 1)  # behind the threshold, of how many pairs, and beyond
-    shorter = [table.columns([0, 1, *last[i:-1]]) for i in range(len(last))]
-    sentences = table.note.split(". ")[:2]
-    note = f"{'. '.join(sentences).removesuffix('.')}."
-    return replace(table, whole=True, narrower=shorter, note=note)
+    """Return a table of strengths; one of relative thresholds loses columns before it is parted."""
+    kept = [i for i, name in enumerate(table.header) if name not in ("pairs", "below", "above")]
+    few = range(2, len(kept) + 1) if len(kept) < len(table.header) else ()
+    shorter = [table.columns([*kept[:2], *kept[i:]]) for i in few]
+    note = f"{'. '.join(table.note.split('. ')[:2]).removesuffix('.')}."
+    return replace(table, whole=bool(few), narrower=shorter, note=note)
 
 
 def findings_of(board: Board, level: str = "") -> list[str]:
