@@ -4,15 +4,24 @@ Nominal sensors follow ``o_t = 0.9 o_{t-1} + 0.1 e_t``; in anomalous rows the la
 """
 
 import csv
+import tomllib
 from dataclasses import dataclass
 
 import numpy as np
+from oodd_logs.inspection.draft import draft
+from oodd_logs.inspection.logs import inspect_logs
+from oodd_logs.recipe import Recipe
 
 from oodd_eval import Trajectory
 from oodd_eval.data.facts import LogFacts, Quantity
 from oodd_eval.data.layout import own_facts, write_environment, write_manifest
 
 UNPAIRED = LogFacts(paired=False)
+
+
+def draft_recipe(path):
+    """Return the recipe that `data inspect` writes of logs, read."""
+    return Recipe.parse(tomllib.loads(draft(inspect_logs(path))), "the draft")
 
 
 @dataclass(frozen=True)

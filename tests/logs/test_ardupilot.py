@@ -5,7 +5,7 @@ import struct
 
 import numpy as np
 import pytest
-from oodd_logs.inspection.draft import draft_recipe
+from helpers_logs import draft_recipe
 from oodd_logs.inspection.logs import recognised
 from oodd_logs.readers import readers
 

@@ -7,10 +7,11 @@ import tracemalloc
 
 import numpy as np
 import pytest
+from helpers_logs import draft_recipe
 from helpers_logs import write_table as write
 from oodd_logs.importing import import_recipe
 from oodd_logs.inspection.columns import ClockFacts, ColumnFacts, time_unit
-from oodd_logs.inspection.draft import draft, draft_recipe
+from oodd_logs.inspection.draft import draft
 from oodd_logs.inspection.logs import inspect_logs
 from oodd_logs.inspection.report import advise, describe_logs, looks_like
 from oodd_logs.recipe import Recipe

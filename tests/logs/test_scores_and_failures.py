@@ -4,8 +4,8 @@ import json
 
 import numpy as np
 import pytest
+from helpers_logs import draft_recipe
 from oodd_logs.importing import import_frames, import_recipe
-from oodd_logs.inspection.draft import draft_recipe
 from oodd_logs.inspection.logs import inspect_logs
 from oodd_logs.inspection.report import as_json, describe_logs
 from oodd_logs.minari_files import export

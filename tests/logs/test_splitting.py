@@ -5,11 +5,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from helpers_logs import draft_recipe
 from helpers_logs import write_table as write
 from oodd_logs import splitting
 from oodd_logs.episodes import read_episodes
 from oodd_logs.importing import import_frames
-from oodd_logs.inspection.draft import draft_recipe
 from oodd_logs.inspection.episode_keys import episode_columns
 from oodd_logs.inspection.logs import inspect_logs
 from oodd_logs.inspection.report import describe_logs

@@ -26,7 +26,6 @@ REACH: Final = (0.8, 0.5, 0.5, 0.6, 0.6, 0.8)  # rad, of way points from home
 MOTION: Final = 0.05  # rad/s, at which dry friction is about three quarters of its full value
 
 _PERIOD: Final = WORLD.value("period")
-_FLANGE: Final = JOINTS + 1  # number of the last link's body in the model
 
 
 def model_xml(world: World = WORLD) -> str:
@@ -179,12 +178,3 @@ class ComputedTorque:
         friction = self._viscous * velocity + self._dry * np.tanh(way_velocity / MOTION)
         torque = data.qfrc_inverse + friction
         return np.asarray(np.clip(torque, -self._torque, self._torque), np.float32)
-
-
-def stretched_torque() -> float:
-    """Return the torque in N m that holds joint 2 of the bare arm stretched out horizontally."""
-    model = mujoco.MjModel.from_xml_string(model_xml())
-    model.body_mass[mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, "payload")] = 0.0
-    data = mujoco.MjData(model)
-    mujoco.mj_inverse(model, data)
-    return float(data.qfrc_inverse[1])

@@ -4,14 +4,13 @@ import fnmatch
 import glob
 import re
 import textwrap
-import tomllib
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, SPLITS
 from oodd_eval.names import listed
-from oodd_logs.inspection.logs import Inspection, inspect_logs
+from oodd_logs.inspection.logs import Inspection
 from oodd_logs.inspection.meaning import (
     cuts_of,
     fields_of,
@@ -28,32 +27,7 @@ from oodd_logs.inspection.report import number, time_lines
 from oodd_logs.inspection.roles import line_of, role_of, toml
 from oodd_logs.kinds import kinds
 from oodd_logs.marks import NOMINAL_WORDS, likely_nominal, plain_label
-from oodd_logs.readers import NO_OPTIONS, Options
-from oodd_logs.recipe import MISSING_ROWS, Recipe
-
-
-def draft_recipe(path: Path, form: str = "", options: Options = NO_OPTIONS) -> Recipe:
-    """Return a first recipe for logs, whose files are relative to their folder.
-
-    Parameters
-    ----------
-    path
-        A file, a folder of files, or the directory of a data set; files of the recipe are relative
-        to the folder, or to the one that the file or data set is in.
-    form, options
-        As of `inspect_logs`.
-
-    Returns
-    -------
-    Recipe
-        What `draft` writes, read.
-
-    Raises
-    ------
-    UsageError, TrajectoryError
-        As `inspect_logs`.
-    """
-    return Recipe.parse(tomllib.loads(draft(inspect_logs(path, form, options))), "the draft")
+from oodd_logs.recipe import MISSING_ROWS
 
 
 def draft(logs: Inspection, prefix: str = "", name: str = "") -> str:
