@@ -12,7 +12,7 @@ import os
 import stat
 import tomllib
 import zipfile
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, Final
@@ -103,13 +103,12 @@ def read_bytes(path: Path, most: int, error: type[OoddError]) -> bytes:
     try:
         with open_plain(path) as file:
             size = os.fstat(file.fileno()).st_size
-            large = size > most
             # Reading takes memory for as many bytes as are asked for.
-            content = b"" if large else file.read(size + 1)
+            content = b"" if size > most else file.read(size + 1)
     except (OSError, ValueError) as problem:  # a name may hold what no file's name may
         why = getattr(problem, "strerror", None) or problem
         raise error(f"{str(path)!r} cannot be read: {why}") from None
-    if large or len(content) > most:
+    if max(size, len(content)) > most:
         raise error(f"{str(path)!r} has more than {most} bytes")
     return content
 
@@ -147,9 +146,7 @@ def _inner(value: Any) -> Iterable[Any]:
     return value if isinstance(value, list) else ()
 
 
-def read_npz(
-    path: Path, bounds: Bounds, names: Collection[str] | None = None
-) -> dict[str, NDArray[Any]]:
+def read_npz(path: Path, bounds: Bounds) -> dict[str, NDArray[Any]]:
     """Return arrays of an ``.npz`` file by name.
 
     Parameters
@@ -158,8 +155,6 @@ def read_npz(
         A file as ``numpy.savez`` writes it.
     bounds
         What its arrays may be; headers are compared with them before content is read.
-    names
-        Arrays to read where the file has them; None for all.
 
     Raises
     ------
@@ -174,11 +169,10 @@ def read_npz(
         with zipfile.ZipFile(path) as archive:
             for item in _few(archive.infolist(), path, bounds):
                 name = item.filename.removesuffix(".npy")
-                if names is None or name in names:
-                    dtype, size = _announced(archive, item)
-                    taken = bounds.check(f"{path}, {name}", dtype, size, taken)
-                    with archive.open(item) as member:
-                        arrays[name] = npy.read_array(member, allow_pickle=False)
+                dtype, size = _announced(archive, item)
+                taken = bounds.check(f"{path}, {name}", dtype, size, taken)
+                with archive.open(item) as member:
+                    arrays[name] = npy.read_array(member, allow_pickle=False)
     except bounds.error:
         raise
     except Exception as error:  # zipfile, zlib and NumPy raise many kinds for damage

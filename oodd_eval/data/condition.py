@@ -15,7 +15,6 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, TABLE1, Suite, in_order
-from oodd_eval.data.registry import environment_spec
 from oodd_eval.errors import SplitError
 from oodd_eval.names import check_known
 
@@ -159,6 +158,8 @@ def ladder_of(environment: str) -> Mapping[str, Any]:
     """Return what is calibrated in an environment, by kind; of a plug-in's from its own file."""
     if environment in ENVIRONMENTS:
         return read_ladder().get(environment, {})
+    from oodd_eval.data.registry import environment_spec  # noqa: PLC0415  of what is recorded
+
     path = environment_spec(environment).ladder
     if path is None:
         return {}

@@ -94,9 +94,11 @@ def describe(
 
 
 def environment_lines(data: EnvironmentData, title: str) -> list[str]:
-    """Return a table of the parts of an environment below a title, its columns, its logs."""
+    """Return a table of the parts of an environment, without empty columns, its logs, sensors."""
     header, rows = (HEADER, group_rows(data)) if data.paired else (LOGS_HEADER, log_rows(data))
-    table = _table(title, *_filled(header, rows))
+    filled = [i for i in range(len(header)) if any(row[i] for row in rows)]
+    rows = [[row[i] for i in filled] for row in rows]
+    table = _table(title, [header[i] for i in filled], rows)
     return [table, "", *log_lines(data), *column_lines(data)]
 
 
@@ -215,12 +217,6 @@ def _mean_return(part: TrajectorySet) -> str:
     """Return mean and spread of returns; an empty text where no reward was recorded."""
     returns = part.returns
     return f"{returns.mean():.1f} ± {returns.std():.1f}" if returns.any() else ""
-
-
-def _filled(header: Sequence[str], rows: Rows) -> tuple[list[str], Rows]:
-    """Return the columns of a table in which any row has something."""
-    kept = [i for i in range(len(header)) if any(row[i] for row in rows)]
-    return [header[i] for i in kept], [[row[i] for i in kept] for row in rows]
 
 
 def _span(values: NDArray[np.int64]) -> str:

@@ -356,6 +356,12 @@ WORLDS: Final = ("arm", "drone", "tank")
 LONG_NAMES: Final = MappingProxyType({name: f"worlds/{name}" for name in WORLDS})
 """What short names mean in the definitions of published splits and seasons."""
 
+
+def short_name(name: str) -> str:
+    """Return the short name of an environment or a kind from a short or a long one."""
+    return name.rpartition("/")[2]
+
+
 _SPLITS: Final = (
     # Protocol 1 used the seed bases 1 to 3: nothing tuned on its splits has seen these episodes.
     SplitDefinition("mini", 40, 40, 10, 300, 4),

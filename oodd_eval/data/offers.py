@@ -9,7 +9,6 @@ import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import chain
 from typing import Any, TypeVar, get_args
 
 from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, NAME_PATTERN
@@ -25,7 +24,6 @@ from oodd_eval.data.registry import (
     inner_of,
     long_name,
     register,
-    short_name,
 )
 from oodd_eval.errors import PluginError, UsageError
 from oodd_eval.names import check_known, listed, select
@@ -104,10 +102,8 @@ class OfferedSpecs:
             if not several:
                 self.select_environments(name)
         plugins = [spec.plugin for spec in meant]
-        for spec in meant:
-            self._only(spec.name, [s for s in meant if s.name == spec.name], plugins)
         specs = [spec for spec in self.specs if isinstance(spec, AnomalySpec)]
-        by_name: dict[str, list[AnomalySpec]] = {}
+        kinds_meant: list[AnomalySpec] = []
         for name in dict.fromkeys([*kinds, *(spec.name for spec in specs)]):
             offered = self.named(name, AnomalySpec)
             suited = [s for s in offered if any(self.is_for(s, s.plugin, e) for e in meant)]
@@ -115,13 +111,14 @@ class OfferedSpecs:
             if name in kinds or (first[1:] and not kinds and first[0].plugin in plugins):
                 if "/" in name:
                     check_known("anomaly", [*map(long_name, specs)], name)
-                first = self._only(name, first, plugins)
-                by_name.setdefault(short_name(name), []).extend(first)
-            elif len(first) == 1:
-                by_name.setdefault(name, first)
-        for name, kinds_meant in by_name.items():
-            self._only(name, kinds_meant, [spec.plugin for spec in kinds_meant])
-        register([*meant, *chain(*by_name.values())])
+                kinds_meant += self._only(name, first, plugins)
+            elif len(first) == 1 and name not in {spec.name for spec in kinds_meant}:
+                kinds_meant += first
+        together: list[Spec] = [*meant, *kinds_meant]
+        for spec in together:
+            same = [s for s in together if (type(s), s.name) == (type(spec), spec.name)]
+            self._only(spec.name, same, [s.plugin for s in same])
+        register(together)
         return [*dict.fromkeys(spec.name for spec in meant)]
 
     def is_for(self, spec: Any, plugin: str, environment: EnvironmentSpec) -> bool:

@@ -272,11 +272,6 @@ def long_name(spec: Spec) -> str:
     return f"{spec.plugin}/{spec.name}" if spec.plugin else spec.name
 
 
-def short_name(name: str) -> str:
-    """Return the short name of a short or long one."""
-    return name.rpartition("/")[2]
-
-
 _environments: Final[dict[str, EnvironmentSpec]] = {}
 _anomalies: Final[dict[str, AnomalySpec]] = {}
 

@@ -11,10 +11,18 @@ from typing import Any, Final
 
 from oodd_eval.data import layout
 from oodd_eval.data.condition import NOMINAL, Condition, in_suite_order
-from oodd_eval.data.facts import ANOMALIES, ENVIRONMENTS, LONG_NAMES, SPLITS, Group, Role, in_order
+from oodd_eval.data.facts import (
+    ANOMALIES,
+    ENVIRONMENTS,
+    LONG_NAMES,
+    SPLITS,
+    Group,
+    Role,
+    in_order,
+    short_name,
+)
 from oodd_eval.data.layout import MANIFEST, GroupCheck
 from oodd_eval.data.parts import NAMES, TRAIN, TWINS, EnvironmentData, check_twins, conditions_in
-from oodd_eval.data.registry import short_name
 from oodd_eval.data.stored import StoredFile
 from oodd_eval.errors import (
     DigestError,
@@ -78,6 +86,14 @@ def split_directories() -> dict[str, Path]:
     return directories
 
 
+def _readable_splits() -> Iterator[tuple[str, "Split"]]:
+    """Yield the splits of `split_directories` by name, but for those that cannot be read."""
+    for name, directory in split_directories().items():
+        with contextlib.suppress(SplitError):
+            _ = Split(directory).manifest
+            yield name, Split(directory)
+
+
 def imported_environments() -> Iterator[tuple[str, str, dict[str, Any]]]:
     """Yield environments of logs in the splits of `split_directories`.
 
@@ -87,32 +103,10 @@ def imported_environments() -> Iterator[tuple[str, str, dict[str, Any]]]:
         Name of the environment, name of the split, and the environment's entry in its manifest.
         Splits that cannot be read are passed over.
     """
-    for name, directory in split_directories().items():
-        with contextlib.suppress(SplitError):
-            for environment, entry in Split(directory).manifest["environments"].items():
-                if "logs" in entry:
-                    yield environment, name, entry
-
-
-def splits_with(environment: str) -> list[str]:
-    """Return the names of the splits of `split_directories` that have an environment.
-
-    Parameters
-    ----------
-    environment
-        Its short or long name.
-
-    Returns
-    -------
-    list of str
-        Splits that cannot be read are passed over.
-    """
-    names = []
-    for name, directory in split_directories().items():
-        with contextlib.suppress(SplitError):
-            if environment in Split(directory).environment_names:
-                names.append(name)
-    return names
+    for name, split in _readable_splits():
+        for environment, entry in split.manifest["environments"].items():
+            if "logs" in entry:
+                yield environment, name, entry
 
 
 def load_split(name: str | Path) -> "Split":
@@ -294,7 +288,8 @@ class Split:
         try:
             selected = select("environment", names, self.environment_names)
         except UnknownNameError as error:
-            if holders := splits_with(error.name):
+            splits = _readable_splits()
+            if holders := [n for n, split in splits if error.name in split.environment_names]:
                 raise UsageError(
                     f"split {self.name} has no environment {error.name!r}: it is in split "
                     f"{' and '.join(holders)}, pass --split {holders[0]}"

@@ -320,8 +320,8 @@ class StrengthTables:
         """The thresholds of the records."""
         return thresholds(self.board.records)
 
-    def overview(self, *, places: bool = False, whole: bool = True) -> list[Table]:
-        """Return all tables, or not `whole` the first one; none without records at strengths.
+    def overview(self, *, places: bool = False) -> list[Table]:
+        """Return all tables; none without records at strengths.
 
         With `places`, each row has a table with its threshold in every environment.
         """
@@ -337,7 +337,7 @@ class StrengthTables:
             over_all, by_kind = [self.relative(order), *tables], self.by_kind(order)
             tables = [*over_all, by_kind] if self._unit_of_mean else [by_kind, *over_all]
             tables += single
-        return tables if whole else tables[:1]
+        return tables
 
     def by_place(self, entry: Setting, by_pair: Mapping[Pair, DetectionThreshold]) -> Table:
         """Return one row's thresholds by environment and kind of anomaly, in the anomaly's unit."""

@@ -38,6 +38,7 @@ from oodd_eval.data.facts import (
     LONG_NAMES,
     SPLITS,
     SplitDefinition,
+    short_name,
 )
 from oodd_eval.data.files import temporary_directory
 from oodd_eval.data.offers import OfferedSpecs
@@ -48,7 +49,6 @@ from oodd_eval.data.registry import (
     environment_spec,
     long_name,
     registered,
-    short_name,
 )
 from oodd_eval.data.split import data_home, load_split
 from oodd_eval.errors import UsageError

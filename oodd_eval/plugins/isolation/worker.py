@@ -271,7 +271,10 @@ def _score_rows(
         for row in rows:
             action = row[1 : 1 + actions].copy() if begun and actions else None
             score = streams[int(row[0])].update(row[1 + actions :].copy(), action)
-            scores.append(struct.pack("<d", _real(score)))
+            score = score.item() if isinstance(score, np.generic) else score
+            if not isinstance(score, numbers.Real):
+                raise ContractError(f"update returned {type(score).__name__}, expected a float")
+            scores.append(struct.pack("<d", score))
         seconds, begun = seconds + time.perf_counter() - start, True
         channel.send_bytes(b"".join(scores))
     channel.send({"seconds_score": seconds, "peak_rss_mb": peak_rss_mb()})
@@ -291,13 +294,6 @@ def _streams(detector: Detector, actions: int, most: int, room: int) -> list[Any
                 break
             streams.append(another)
     return streams
-
-
-def _real(score: object) -> float:
-    score = score.item() if isinstance(score, np.generic) else score
-    if not isinstance(score, numbers.Real):
-        raise ContractError(f"update returned {type(score).__name__}, expected a float")
-    return float(score)
 
 
 class _Prefixes:
