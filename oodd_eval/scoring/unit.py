@@ -100,7 +100,7 @@ class UnitJob:
                 raise
             # Of a worker it is a plug-in that nobody thought of.
             reason = describe(error) if local else f"oodd-eval: {describe(error)}"
-            status: Status = "invalid" if isinstance(error, ContractError) else "error"
+            status: Status = "invalid" if local and isinstance(error, ContractError) else "error"
             return Scored(status, reason, log=traceback.format_exc())
 
     def _isolated(

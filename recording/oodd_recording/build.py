@@ -377,8 +377,6 @@ def _further(definition: SplitDefinition, planned: list[Chunk], work: Path) -> l
 
 def _run(chunks: list[Chunk], work: Path, jobs: int | None) -> Iterator[Chunk]:
     """Record chunks in worker processes, yielding each when its file is there."""
-    if not chunks:
-        return
     with workers(jobs) as pool:
         running = {pool.submit(record_chunk, chunk, work): chunk for chunk in chunks}
         for future in as_completed(running):
@@ -471,12 +469,8 @@ def _joined(part: str, files: Sequence[Path], held: Mapping[Path, Any]) -> layou
 
     def stored(name: str) -> Iterator[NDArray[Any]]:
         for file in files:
-            kept = file in held
-            with (
-                contextlib.nullcontext(held[file])
-                if kept
-                else np.load(file, allow_pickle=False) as chunk
-            ):
+            npz = held.get(file)
+            with contextlib.nullcontext(npz) if npz else np.load(file, allow_pickle=False) as chunk:
                 if f"{part}:{name}" in chunk:
                     yield chunk[f"{part}:{name}"]
 

@@ -207,10 +207,8 @@ def strengths_ahead(
         points = {0.0: base} | {s: np.array(returns) for s, returns in curve.items()}
         if not curve:  # the bound comes first, and may cost half
             points[2 * strength] = base - abs(base.mean())
-        below, above = (
-            max(s for s in points if s < strength),
-            min(s for s in points if s > strength),
-        )
+        below = max(s for s in points if s < strength)
+        above = min(s for s in points if s > strength)
         share = (strength - below) / (above - below)
         curve[strength] = list(points[below] + share * (points[above] - points[below]))
         ahead.append(strength)

@@ -298,12 +298,8 @@ def _setting(names: Sequence[str], factor: float, **drawn: Any) -> Fault:
     return Dynamics(act, **drawn)
 
 
-def _gravity(_: str, strength: float, __: Simulator, ___: np.random.Generator) -> Fault:
-    return _setting(["gravity"], 1 + strength)
-
-
-def _mass(_: str, strength: float, __: Simulator, ___: np.random.Generator) -> Fault:
-    return _setting(["body_mass"], 1 + strength)
+def _larger(attribute: str) -> _Maker:
+    return lambda _environment, strength, *_: _setting([attribute], 1 + strength)
 
 
 def choose_attributes(environment: str, rng: np.random.Generator) -> list[str]:
@@ -425,7 +421,7 @@ MAKERS: Final[dict[str, _Maker]] = {
     "shutdown": _shutdown,
     "wind-l2r": _wind(1),
     "wind-r2l": _wind(-1),
-    "gravity": _gravity,
+    "gravity": _larger("gravity"),
     "components": _components,
     "ar1": _ar1,
     "varma": _varma,
@@ -436,7 +432,7 @@ MAKERS: Final[dict[str, _Maker]] = {
     "stuck-joint": _stuck_joint,
     "latency": _latency,
     "action-noise": _action_noise,
-    "mass": _mass,
+    "mass": _larger("body_mass"),
     "friction": _friction,
     "iid-intermittent": _noise,
     "calibration-intermittent": _calibration,

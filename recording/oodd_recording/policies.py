@@ -174,8 +174,7 @@ def layer_policy(file: str, environment: str, arrays: Arrays) -> ImportedPolicy:
         layers(np.zeros(info.observation_dim, np.float32))
     except (ValueError, KeyError) as error:
         raise PolicyError(f"{file} holds no policy of layers that fit: {error}") from error
-    if layers.widths != (info.observation_dim, info.action_dim):
-        raise PolicyError(_widths(file, layers.widths, info))
+    _check_widths(file, layers.widths, info)
     return ImportedPolicy(environment, layers, policy_digest(arrays))
 
 
@@ -189,16 +188,16 @@ def _graph(environment: str, file: Path) -> ImportedPolicy:
     except Exception as error:  # onnxruntime's errors have no common base
         text = str(error).partition("\n")[0]
         raise PolicyError(f"{file.name} cannot act in {environment}: {text:.200}") from error
-    if width != info.action_dim:
-        raise PolicyError(_widths(file.name, (info.observation_dim, width), info))
+    _check_widths(file.name, (info.observation_dim, width), info)
     return ImportedPolicy(environment, run, digest)
 
 
-def _widths(file: str, widths: tuple[int, int], info: EnvironmentInfo) -> str:
-    return (
-        f"{file} maps {widths[0]} sensors to {widths[1]} actions, expected "
-        f"{info.observation_dim} and {info.action_dim} for {info.id}"
-    )
+def _check_widths(file: str, widths: tuple[int, int], info: EnvironmentInfo) -> None:
+    if widths != (info.observation_dim, info.action_dim):
+        raise PolicyError(
+            f"{file} maps {widths[0]} sensors to {widths[1]} actions, expected "
+            f"{info.observation_dim} and {info.action_dim} for {info.id}"
+        )
 
 
 def make_policy(file: str, info: EnvironmentInfo, arrays: Arrays) -> Policy:
@@ -207,8 +206,7 @@ def make_policy(file: str, info: EnvironmentInfo, arrays: Arrays) -> Policy:
         raise PolicyError(f"{file} lacks the arrays {missing} of a {info.policy} policy")
     last = arrays["b3"] if info.policy == "TD3" else arrays["b4"]
     widths = (len(np.atleast_1d(arrays["W1"])), np.atleast_1d(last).shape[-1])
-    if widths != (info.observation_dim, info.action_dim):
-        raise PolicyError(_widths(file, widths, info))
+    _check_widths(file, widths, info)
     if bad := [name for name, a in arrays.items() if not np.isfinite(a).all()]:
         raise PolicyError(f"{file} holds values that are not finite in {', '.join(bad)}")
     try:

@@ -29,10 +29,8 @@ deviation of each sensor in these rows.
 """
 
 MEASURED.update(
-    {
-        name: Measured(tuple(spread), tuple(VALUES["sensors"][name]))
-        for name, spread in VALUES["spread"].items()
-    }
+    (name, Measured(tuple(spread), tuple(VALUES["sensors"][name])))
+    for name, spread in VALUES["spread"].items()
 )
 
 

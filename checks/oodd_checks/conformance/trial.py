@@ -75,7 +75,10 @@ class Trial:
         seed: int = 0,
         parameters: Mapping[str, Any] | None = None,
     ) -> None:
-        self.spec = factory if isinstance(factory, DetectorSpec) else _spec_of(factory)
+        if not isinstance(factory, DetectorSpec):
+            refuse_foreign(factory)
+            factory = DetectorSpec("", factory_of(factory), "", inputs="observations+actions")
+        self.spec = factory
         self.actions = self.spec.inputs == "observations+actions"
         self.sensors = len(self.spec.columns) or SENSORS
         self.horizon, self.seed, self.parameters = horizon, seed, dict(parameters or {})
@@ -200,11 +203,6 @@ class Trial:
         """Return episodes in which all sensors get ten times noisier, with twins and onsets."""
         twins = [(self.episode(3000 + i), self.rows // 2 + i) for i in range(n)]
         return [(noisy_from(twin, onset), twin, onset) for twin, onset in twins]
-
-
-def _spec_of(factory: Callable[..., Detector] | Detector) -> DetectorSpec:
-    refuse_foreign(factory)
-    return DetectorSpec("", factory_of(factory), "", inputs="observations+actions")
 
 
 def noisy_from(trajectory: Trajectory, row: int) -> Trajectory:
