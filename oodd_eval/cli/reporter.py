@@ -112,13 +112,6 @@ class TerminalReporter(Display):
         self.line("  ".join(parts), _COLOURS.get(last.status, "red"))
 
 
-def rest(path: Path) -> str:
-    """Return where everything is that a run's table leaves out."""
-    file = path / REPORT
-    more = f", {file}" * file.is_file()
-    return f"everything else: oodd-eval show {shlex.quote(str(path))} --wide{more}"
-
-
 def print_report(report: Report, console: Console, path: Path) -> None:
     """Print a report of results in a directory, and where all is that a brief one leaves out."""
     print_sections(report.sections, console)

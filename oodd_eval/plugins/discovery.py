@@ -213,9 +213,8 @@ class Plugins:
         specs = tuple(s for s, _ in self._offered(lambda p: p.custom_specs(), check_spec))
         names = ((n, b) for b in self.broken for n in (b.plugin, *self._claims.get(b.plugin, ())))
         reasons = {n: f"{b.plugin!r} of {b.distribution}: {b.reason}" for n, b in names}
-        return OfferedSpecs(
-            specs, {n: reasons[n] for n in {*reasons} - {*ENVIRONMENTS, *ANOMALIES}}
-        )
+        ours = {*ENVIRONMENTS, *ANOMALIES}
+        return OfferedSpecs(specs, {n: why for n, why in reasons.items() if n not in ours})
 
     def origin(self, plugin: str) -> str:
         """Return what messages call a loaded plug-in."""

@@ -24,10 +24,8 @@ def available_cores(root: Path = Path("/")) -> int:
     root
         Directory that holds ``proc`` and ``sys``.
     """
-    if hasattr(os, "sched_getaffinity"):
-        cores = len(os.sched_getaffinity(0))
-    else:
-        cores = os.cpu_count() or 1
+    bound = hasattr(os, "sched_getaffinity")  # not on macOS
+    cores = len(os.sched_getaffinity(0)) if bound else os.cpu_count() or 1
     return max(1, int(min(cores, *_limits(), *_grants(root))))
 
 

@@ -174,10 +174,8 @@ class Display:
         """Return a line on each unit that runs, of many on the first ones."""
         running = list(self._running.values())
         more = len(running) - _MOST_RUNNING
-        return [
-            *map(str, running[:_MOST_RUNNING]),
-            *([f"and {counted(more, 'more fit(s)')}"] if more > 0 else []),
-        ]
+        lines = [str(unit) for unit in running[:_MOST_RUNNING]]
+        return lines + [f"and {counted(more, 'more fit(s)')}"] * (more > 0)
 
     def _break_silence(self) -> None:
         """Print what runs after every `SILENCE`, in a thread, until the run has ended."""

@@ -200,10 +200,8 @@ def make_plan(
         for (name, row), among in taking.items()
     )
     notes += tuple(f"{name} is left out: {r}" for name, rs in lacking.items() for r in rs)
-    notes += tuple(
-        f'{name} reads actions and is given none: declare inputs="observations+actions" in its spec'
-        for name in dict.fromkeys(unaware)
-    )
+    advice = 'declare inputs="observations+actions" in its spec'
+    notes += tuple(f"{n} reads actions and is given none: {advice}" for n in dict.fromkeys(unaware))
     return Plan(split.name, split.digest, tuple(units), split.groups, limit, strengths, notes)
 
 

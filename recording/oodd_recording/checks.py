@@ -303,13 +303,10 @@ _ANOMALY: Final = (
 
 def _checks_of(spec: Spec) -> Iterator[Callable[[Subject], None]]:
     """Yield the checks of a spec: how a fault ends and grows matters where it does."""
-    if not isinstance(spec, AnomalySpec):
-        yield from _ENVIRONMENT
-        return
-    yield from _ANOMALY
-    if spec.lasts or spec.pulses or spec.intermittent:
+    yield from _ANOMALY if isinstance(spec, AnomalySpec) else _ENVIRONMENT
+    if isinstance(spec, AnomalySpec) and (spec.lasts or spec.pulses or spec.intermittent):
         yield check_end
-    if spec.ramp:
+    if isinstance(spec, AnomalySpec) and spec.ramp:
         yield check_share
 
 
@@ -318,8 +315,7 @@ def custom_checks(spec: Spec, environment: str) -> Iterator[tuple[str, Callable[
 
     `environment` is the one in which an anomaly is tried.
     """
-    anomaly = isinstance(spec, AnomalySpec)
-    subject = Subject(environment, spec.name if anomaly else "")
+    subject = Subject(environment, spec.name if isinstance(spec, AnomalySpec) else "")
     for check in _checks_of(spec):
         name = check.__name__.removeprefix("check_").replace("_", "-")
         yield name, functools.partial(_carried_out, check, subject)
