@@ -130,7 +130,7 @@ class Board:
         self.brief = [cell for cell in everywhere if cell in brief]
         # Several tables show the same means, and many means are over the same values.
         self._mean = functools.cache(self._computed)
-        self._values = functools.cache(self._values_of)
+        self._values = functools.cache(lambda row, name: _values_of(self._rows[row], name))
 
     def in_group(self, group: str) -> list[str]:
         """Return the anomalies of a group that were evaluated."""
@@ -213,10 +213,6 @@ class Board:
         values = self._values(entry, metric)
         value = mean_over_cells((of_row[i].seed, values[i]) for i in indices)
         return blank._replace(value=value, low=ends[0], high=ends[1])
-
-    def _values_of(self, entry: Setting, metric: str) -> list[float]:
-        """Return a metric of all records of a row."""
-        return _values_of(self._rows[entry], metric)
 
     def seed_means(self, entry: Setting, metric: str) -> list[float]:
         """Return an entry's mean over expected cells with each detector seed, NaN left out."""

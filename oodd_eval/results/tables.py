@@ -178,8 +178,9 @@ class Tables:
         compared = [e for e in board.environments if self._present([metric], [e])]
         places, several = [Column(metric, e, [e]) for e in compared], len(compared) > 1
         if not several:
-            places = [Column(metric, k, anomalies=[k]) for k in board.anomalies]
-            places = [column for column in places if cells_with(metric, self._of(column.title))]
+            of_kind = grouped(board.records, lambda r: r.anomaly)
+            kinds = [kind for kind in board.anomalies if cells_with(metric, of_kind[kind])]
+            places = [Column(metric, kind, anomalies=[kind]) for kind in kinds]
         titles = [metric_info(metric).title] * bool(first)
         titles += [f"guaranteed alarms at {percent_of(self.suffix)}"] * bool(alarms)
         title = f"{' and '.join(titles)} (%)"
@@ -229,9 +230,6 @@ class Tables:
             _FINDS * any(column.metric.startswith("missed") for column in alarms),
         ]
         return [f"{note[0].upper()}{note[1:]}" for note in notes if note]
-
-    def _of(self, anomaly: str) -> list[Record]:
-        return [r for r in self.board.records if r.anomaly == anomaly]
 
     @functools.cached_property
     def suffix(self) -> str:
