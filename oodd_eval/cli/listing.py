@@ -58,17 +58,18 @@ def rows(kind: str, plugins: Plugins) -> Rows:
                 yield e.id, e.simulator, f"{e.observation_dim} sensors, {e.policy} policy"
             for env, name, origin in _custom(plugins, EnvironmentSpec):
                 yield name, origin, f"{counted(len(env.sensors), 'sensor(s)')}, its own policy"
-            yield from (*_imported(), *_broken(plugins))
+            yield from _imported()
         case "anomalies":
             for a in ANOMALIES.values():
                 yield a.id, a.group, a.summary
             for anomaly, name, origin in _custom(plugins, AnomalySpec):
                 yield name, anomaly.group, f"{anomaly.summary} ({origin})"
-            yield from _broken(plugins)
         case "splits":
             yield from _splits()
         case "metrics":
             yield from _metrics()
+    for broken in plugins.broken if kind in KINDS[:3] else ():
+        yield broken.plugin, broken.distribution, f"[broken plug-in] {broken.reason}"
 
 
 def _custom(plugins: Plugins, kind: type[T]) -> Iterable[tuple[T, str, str]]:
@@ -98,11 +99,6 @@ def _detectors(plugins: Plugins) -> Rows:
         yield name, _origin(offer), marks + offer.spec.summary
     for name, origin, forms in plugins.spec_forms():
         yield f"({name})", origin, forms
-    yield from _broken(plugins)
-
-
-def _broken(plugins: Plugins) -> Rows:
-    yield from ((b.plugin, b.distribution, f"[broken plug-in] {b.reason}") for b in plugins.broken)
 
 
 def _group(entry: tuple[str, Offer]) -> tuple[object, ...]:
