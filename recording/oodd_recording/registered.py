@@ -108,9 +108,12 @@ def _is_hidden(part: str) -> bool:
 
 
 def _is_ladder(file: Path, spec: EnvironmentSpec) -> bool:
-    """Tell whether a file is the environment's ladder, or what its calibration has measured."""
+    """Tell whether a file is the environment's ladder, or what a calibration has measured."""
     ladder = spec.ladder
-    return ladder is not None and file.parent == ladder.parent and file.name.startswith(ladder.name)
+    # A spec may name its ladder only once the calibration has ended.
+    return file.suffix == ".work" or (
+        ladder is not None and file.parent == ladder.parent and file.name.startswith(ladder.name)
+    )
 
 
 def packages_of(environments: Iterable[str]) -> list[str]:

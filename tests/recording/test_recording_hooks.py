@@ -407,6 +407,14 @@ def test_the_digest_is_of_the_whole_package_but_for_caches_and_ladders(package):
     assert len(set(digests)) == 4
 
 
+def test_the_digest_leaves_out_what_the_first_calibration_measures(package):
+    module = sys.modules["oodd_packed"]
+    register([EnvironmentSpec("packed", module.make, module.make, (), (), 99)])  # no ladder yet
+    before = code_digest("packed", [])
+    (package / "ladder.json.work").write_text("x")
+    assert code_digest("packed", []) == before
+
+
 def test_the_digest_does_not_depend_on_where_a_package_lies(package, monkeypatch):
     before = code_digest("packed", [])
     elsewhere = package.parent / "z" / "y"
