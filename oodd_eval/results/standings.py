@@ -282,7 +282,8 @@ def verdict_of(board: Board, level: str = "") -> str:
     i, n = band.index(mine), len(band)
     rival = band[i - 1] if i else band[1]
     many = f"number {i + 1} of {n}"
-    rank = f"{mine} is {many if n > len(_PLACES) else f'{_PLACES[i]} of {_NUMBERS[n - 1]}'}"
+    would = ", not ranked for what it knows, would be" if mine in knowing else " is"
+    rank = f"{mine}{would} {many if n > len(_PLACES) else f'{_PLACES[i]} of {_NUMBERS[n - 1]}'}"
     if len(board.entries) > n:
         rank += f" {'rows that learn from failures' if mine in board.supervised else 'ranked rows'}"
     means = [board.of(row, Column(metric)) for row in (mine, rival)]
@@ -294,7 +295,11 @@ def verdict_of(board: Board, level: str = "") -> str:
         return "" if math.isnan(means[0].value) else f"{rank}."
     ahead = "ahead of" if test.first_is_better else "behind"
     scope = f" in {metric_info(metric).phrase}"
-    if any(mean.state or mean.partial for mean in means):
+    # Means of the table are over other cells where some of a row have no figure.
+    if any(
+        mean.state or mean.partial or not math.isclose(mean.value, value)
+        for mean, value in zip(means, test.values, strict=True)
+    ):
         scope += f", over the {counted(test.cells, 'cell(s)')} that both have"
     if test.told_apart:
         return f"{rank}, {test.amount} {ahead} {rival}{scope}."

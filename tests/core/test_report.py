@@ -517,6 +517,42 @@ def test_rows_that_failed_or_know_more_than_nominal_episodes_are_no_rivals():
     assert text.endswith("] ahead of mewma in matched AUC, over the 1 cell that both have.")
 
 
+def test_a_row_of_which_every_cell_failed_costs_no_report():
+    failed = own("jumps", status="timeout", reason="not done")
+    (section,) = Report([failed, *rows(mewma=BASE, rf=RAISED)]).sections
+    assert section.verdict == "jumps has no place: timeout."
+    both = [*rows(mewma=BASE), make_record("pe", "cartpole", status="oom")]
+    assert verdict_of(Board(both)) == "mewma is first of two."
+    assert verdict_of(Board(both[::-1])) == "pe has no place: oom."
+    none = [replace(r, status="oom", metrics={}, per_trajectory={}) for r in both]
+    assert verdict_of(Board(none)) == "mewma has no place: oom."
+
+
+@pytest.mark.parametrize("training", ["simulation", "anomalies", "external", "oracle"])
+def test_an_own_row_that_knows_more_is_said_not_to_be_ranked(training):
+    theirs = replace(own("jumps", values={"auc_matched": RAISED}), training=training)
+    text = verdict_of(Board([*rows(mewma=BASE), theirs]))
+    assert text.startswith("jumps, not ranked for what it knows, would be first of two, 10.0 poin")
+
+
+def test_a_difference_over_other_cells_than_the_tables_is_said_to_be():
+    """Cells without a figure, and cells that the table leaves out."""
+    undefined = {"auc_matched": [None] * 12}
+    values = {"mewma": BASE, "rf": RAISED}
+    ants = [
+        make_record("mewma", "ant", values=undefined),
+        make_record("rf", "ant", values={"auc_matched": [0.9] * 12}),
+    ]
+    text = verdict_of(Board([*rows(**values), *ants]))
+    assert text.endswith("behind rf in matched AUC, over the 1 cell that both have.")
+    # Two of five rows have a cell more, which then is not expected of any.
+    more = rows(environment="ant", mewma=RAISED, rf=BASE)
+    others = rows(a=[0.1] * 12, b=[0.1] * 12, c=[0.1] * 12)
+    board = Board([*rows(**values), *more, *others])
+    assert verdict_of(board).endswith(", over the 2 cells that both have.")
+    assert verdict_of(Board(rows(**values))).endswith("behind rf in matched AUC.")
+
+
 FLAT = {"auc_matched": [0.5] * 12}
 
 
