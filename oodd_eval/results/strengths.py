@@ -461,8 +461,13 @@ class StrengthTables:
                 if (of_kind := [r for r in columns[name] if r.anomaly == kind])
             }
         steps = [Board(of_column) for of_column in columns.values()]
+        # A row may have no record at a strength.
         return [*columns], {
-            e: [show_value(board.of(e, Column(metric)), metric) for board in steps] for e in entries
+            e: [
+                show_value(board.of(e, Column(metric)), metric) if e in board.entries else ""
+                for board in steps
+            ]
+            for e in entries
         }
 
 

@@ -136,6 +136,14 @@ def test_a_place_with_a_missing_or_failed_rung_has_no_threshold():
     assert (row["threshold"], row["pairs"], row["kept99"]) == (UNDEFINED, "0", "oom")
 
 
+def test_a_row_without_a_record_at_a_strength_has_an_empty_field_there():
+    records = [*RECORDS, *at("late", ("hopper", "iid"), {"4th": 0.5})]
+    for detail in ("brief", "full"):
+        assert "late" in str(Report(records, detail=detail))
+    late = rows_of(table_of(records, "Matched AUC (%) by strength"))["late"]
+    assert (late["4th"], late["kept50"]) == ("75.0*", "")
+
+
 def test_all_detector_seeds_count():
     shares = ((0, 0, 0, 1), (0, 1, 1, 1))
     both = [r for seed, own in enumerate(shares) for r in all_of("rf", *own, seed=seed)]
