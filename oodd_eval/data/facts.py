@@ -358,7 +358,18 @@ LONG_NAMES: Final = MappingProxyType({name: f"worlds/{name}" for name in WORLDS}
 
 
 def short_name(name: str) -> str:
-    """Return the short name of an environment or a kind from a short or a long one."""
+    """Return the short name of an environment or a kind.
+
+    Parameters
+    ----------
+    name
+        A short name, or a long one, ``PLUGIN/NAME``.
+
+    Returns
+    -------
+    str
+        What stands behind the plug-in.
+    """
     return name.rpartition("/")[2]
 
 
