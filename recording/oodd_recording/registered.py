@@ -99,12 +99,8 @@ def _package_of(file: Path) -> dict[str, Path]:
     return {
         name.as_posix(): path
         for name, path in names.items()
-        if path.is_file() and not any(_is_hidden(part) for part in name.parts)
+        if path.is_file() and not any(p[0] == "." or p == "__pycache__" for p in name.parts)
     }
-
-
-def _is_hidden(part: str) -> bool:
-    return part.startswith(".") or part == "__pycache__"
 
 
 def _is_ladder(file: Path, spec: EnvironmentSpec) -> bool:
