@@ -111,7 +111,7 @@ class PrecisionWarning(UserWarning):
     """Readings lose what they tell when they are rounded to float32."""
 
 
-class MissingExtraError(OoddError, ImportError):
+class MissingExtraError(OoddError, ModuleNotFoundError):
     """An optional dependency that the requested work needs."""
 
 

@@ -48,6 +48,11 @@ class Unsuited(Good):
 class Unequipped(Good):
     def fit(self, nominal): import no_such_module
 
+class WithoutExtra(Good):
+    def fit(self, nominal):
+        from oodd_eval.errors import MissingExtraError
+        raise MissingExtraError("needs torch: install oodd-eval[reference]")
+
 def no_detector(**settings): return 42
 
 @hookimpl
@@ -67,6 +72,7 @@ STATES = {
     "raisesinfit": ("error", r"RuntimeError: no mood \(oodd_hostile.py:\d+\)"),
     "unsuited": ("incompatible", "NotImplementedError: continuous actions only"),
     "unequipped": ("unavailable", "No module named 'no_such_module'"),
+    "withoutextra": ("unavailable", r"needs torch: install oodd-eval\[reference\]"),
     "unavailable": ("unavailable", r'needs no_such: pip install "oodd-x\[y\]"'),
     "no-detector": ("invalid", "the factory returned int, expected an object with the methods"),
     "clock": ("ok", ""),

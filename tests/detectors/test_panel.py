@@ -1,5 +1,6 @@
 """The panel: its forecast, members and tails by hand and by second formulas, and what it finds."""
 
+import sys
 from functools import partial
 
 import numpy as np
@@ -39,7 +40,7 @@ from sklearn.neighbors import NearestNeighbors
 
 from oodd_eval import Trajectory, load_split
 from oodd_eval.cli.main import main
-from oodd_eval.errors import FittedStateError, TrajectoryError, UsageError
+from oodd_eval.errors import FittedStateError, MissingExtraError, TrajectoryError, UsageError
 from oodd_eval.metrics.alarms import GuaranteedAlarm, guaranteed_contributions
 
 MIXING = np.random.default_rng(7).normal(size=(3, 8)) / 2
@@ -365,6 +366,15 @@ def spoilt(seed, by=0.0):
         rows[rng.integers(20, 180) :][:8, 1] *= 1e3 * np.exp(rng.normal())
     rows[120:, 0] += by
     return Trajectory(rows)
+
+
+def test_a_panel_without_its_networks_is_unavailable(monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch", None)
+    for name in [name for name in sys.modules if name.startswith("oodd_pe.")]:
+        monkeypatch.delitem(sys.modules, name)
+    panel = make_panel("panel", seed=0, horizon=1, forecast="ensemble")
+    with pytest.raises(MissingExtraError, match=r"needs torch: install oodd-eval\[reference\]"):
+        panel.fit([log_of(seed) for seed in range(20)])
 
 
 def test_a_voice_with_a_heavy_tail_does_not_set_the_threshold(monkeypatch):

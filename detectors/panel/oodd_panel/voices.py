@@ -16,7 +16,7 @@ from oodd_common.charts import Floats
 from oodd_pe import make_pe
 
 from oodd_eval import Trajectory
-from oodd_eval.errors import TrajectoryError
+from oodd_eval.errors import MissingExtraError
 from oodd_eval.plugins.state import Arrays, State, take
 
 if TYPE_CHECKING:
@@ -215,7 +215,7 @@ class EnsembleVoice(Voice):
         try:
             return make_pe(name, seed=panel.seed, horizon=panel.horizon)
         except ImportError as error:
-            raise TrajectoryError(
+            raise MissingExtraError(
                 f"detector {panel.name!r} fits an ensemble of networks on so many rows, which "
                 f"needs {error.name}: install oodd-eval[reference], or set forecast=linear"
             ) from error
