@@ -208,7 +208,7 @@ def _lines(text: str, room: int) -> str:
 _NARROW: Final = 6
 """Width of a column that headings are wrapped to where its figures are narrower."""
 
-_PARTS: Final = re.compile(r"(\s+)|(?<=[-\[,:.=])(?=[^-\[,:.=\s])|(?<=[a-z])(?=[A-Z])")
+_PARTS: Final = re.compile(r"(\s+)|(?<=[-\[,:.=])(?=[^-\[,:.=\s])|(?<=[a-z])(?=[A-Z\d])")
 """Ends of lines are between words, and in names behind what separates their parts."""
 
 _WORD: Final = re.compile(r"[^\W\d_]+")

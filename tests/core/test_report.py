@@ -686,6 +686,12 @@ def test_piped_output_has_no_escapes_and_fits_80_columns(tmp_path):
 WIDE = [f"column {i}" for i in range(8)]
 
 
+def test_a_heading_is_divided_before_its_number():
+    names = [f"loss{n}" for n in (1, 5, 10, 25, 100)]
+    printed = printed_table(Table("", ["detector", *names], [["mewma", *["1.0"] * 5]]), 44)
+    assert [line.split() for line in printed[1:3]] == [["detector", *names[:4], "loss"], ["100"]]
+
+
 @pytest.mark.parametrize("rows", [1, 9])
 def test_a_table_that_is_too_wide_comes_in_parts_with_its_labels(rows):
     texts = [[f"row {i}", *map(str, range(123456, 123463))] for i in range(rows)]
