@@ -134,7 +134,7 @@ def test_expected_failures_horizon_and_parameters_reach_the_checks(check):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["fin"], "unknown detector 'fin': did you mean 'fine'"),
+        (["fin"], "anomaly of a plug-in 'fin': did you mean 'fine'"),
         (["fine", "--param", "x=1"], "unknown parameter of fine 'x'"),
         (["fine", "--expect", "ordr=x"], "unknown check 'ordr': did you mean 'order'"),
         (["fine", "--seed", "-1"], "'--seed'"),

@@ -177,6 +177,8 @@ def test_they_are_listed_described_and_pass_their_checks(basin, capsys):
     assert (code, "6 passed" in told) == (0, True)
     assert checked("seep", capsys, "--env", "valve", "-k", "onset or draws")[0] == 0
     assert checked("seep", capsys, "-k", "nothing")[0] == 5
+    assert main(["check", "basin/bason"]) == 4
+    assert "'basin/bason': did you mean 'basin/basin'?" in capsys.readouterr().err
 
 
 def test_what_grows_ends_and_rests_passes_its_checks(cistern, capsys):

@@ -18,6 +18,7 @@ from oodd_eval.cli import (
 )
 from oodd_eval.cli.console import make_console
 from oodd_eval.cli.plugins import discovered
+from oodd_eval.data.registry import long_name
 from oodd_eval.errors import UnknownNameError
 from oodd_eval.names import assignment, check_known, expression
 from oodd_eval.plugins.isolation.child import Limits
@@ -61,10 +62,12 @@ def check(options: Options) -> int:
     plugins = discovered(options)
     try:
         offer = plugins.offer(options.name)
-    except UnknownNameError:
+    except UnknownNameError as unknown:
         offered = plugins.custom_specs
         if not (meanings := offered.meanings(options.name)):
-            raise
+            names = [name for spec in offered.specs for name in (spec.name, long_name(spec))]
+            kinds = "detector, environment or anomaly of a plug-in"
+            raise UnknownNameError(kinds, options.name, [*unknown.known, *names]) from None
         refuse(options, _OF_DETECTORS, f"is for detectors, and {options.name} is none")
         check_custom = load("oodd_recording.commands:check_custom")
         return int(check_custom(options, selects, *meanings, offered) or bool(plugins.broken))
