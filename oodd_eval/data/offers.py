@@ -139,7 +139,8 @@ class OfferedSpecs:
         by_name = {long_name(spec): spec for spec in of_plugins or several}
         if len(by_name) > 1:
             long = listed(sorted(by_name), 9)
-            raise UsageError(f"{name!r} is the short name of {long}: expected one of these names")
+            expected = "expected one of these names, and a split of its own for each"
+            raise UsageError(f"{name!r} is the short name of {long}: {expected}")
         return [*by_name.values()]
 
 

@@ -262,18 +262,18 @@ class Record:
     magnitude: float | None = None
     limit: int | None = None
     reason: str = ""
-    metrics: dict[str, Metric] = field(default_factory=dict)
+    metrics: dict[str, Metric] = field(default_factory=dict, repr=False)
     brief: bool = False
     counts: dict[str, int] = field(default_factory=dict)
     recordings: dict[str, tuple[int, ...]] = field(default_factory=dict)
-    per_trajectory: Mapping[str, Terms] = field(default_factory=dict)
-    calibration_draws: Draws = field(default_factory=CodedDraws)
+    per_trajectory: Mapping[str, Terms] = field(default_factory=dict, repr=False)
+    calibration_draws: Draws = field(default_factory=CodedDraws, repr=False)
     scores: str = ""
     seconds_fit: Number = NAN
     seconds_score: Number = NAN
     steps_scored: int | None = None
     peak_rss_mb: Number = NAN
-    provenance: dict[str, Any] = field(default_factory=dict)
+    provenance: dict[str, Any] = field(default_factory=dict, repr=False)
     paired: bool = True
     rolling: bool = False
     note: str = ""

@@ -292,7 +292,7 @@ def verdict_of(board: Board, level: str = "") -> str:
     except (ResultsError, UnknownNameError):  # without a cell in common, or without any
         if means[0].state:
             return f"{mine} has no place: {means[0].state}."
-        return "" if math.isnan(means[0].value) else f"{rank}."
+        return "" if math.isnan(means[0].value) else f"{rank}: {rival} has no figure beside it."
     ahead = "ahead of" if test.first_is_better else "behind"
     scope = f" in {metric_info(metric).phrase}"
     # Means of the table are over other cells where some of a row have no figure.

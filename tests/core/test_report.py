@@ -509,7 +509,7 @@ def test_rows_that_failed_or_know_more_than_nominal_episodes_are_no_rivals():
     assert verdict_of(Board([failed, *rows(**values)])) == "pe has no place: timeout."
     assert verdict_of(Board([failed, theirs])) == "jumps has no place: error."
     alone = verdict_of(Board([rows(**values)[0], failed]))
-    assert alone == "mewma is first of two."
+    assert alone == "mewma is first of two: pe has no figure beside it."
     # One that lacks a cell is compared over what both have, and said to be.
     more = [*rows(**values), *(r for d in values for r in [make_record(d, "ant", values=FLAT)])]
     text = verdict_of(Board([*more, own("jumps", values={"auc_matched": [0.9] * 12})]))
@@ -522,7 +522,7 @@ def test_a_row_of_which_every_cell_failed_costs_no_report():
     (section,) = Report([failed, *rows(mewma=BASE, rf=RAISED)]).sections
     assert section.verdict == "jumps has no place: timeout."
     both = [*rows(mewma=BASE), make_record("pe", "cartpole", status="oom")]
-    assert verdict_of(Board(both)) == "mewma is first of two."
+    assert verdict_of(Board(both)) == "mewma is first of two: pe has no figure beside it."
     assert verdict_of(Board(both[::-1])) == "pe has no place: oom."
     none = [replace(r, status="oom", metrics={}, per_trajectory={}) for r in both]
     assert verdict_of(Board(none)) == "mewma has no place: oom."
