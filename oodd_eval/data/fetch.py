@@ -356,6 +356,8 @@ def _download(address: str, target: Path, most: int) -> None:
         expected = have + int(length) if length and length.isdigit() else None
         try:
             _copy(response, target, most, address, have=have)
+        except OutputError:  # of this disk, not of the network
+            raise
         except (OSError, http.client.HTTPException) as error:
             raise SplitError(f"{address} broke off ({_plain(error)}): {again}") from error
     got = target.stat().st_size

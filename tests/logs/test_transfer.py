@@ -302,12 +302,16 @@ def test_a_download_without_end_is_given_up(tiny_split, home, web, monkeypatch):
     assert not list(home.rglob("archive"))
 
 
-def test_a_fetch_leaves_some_of_the_disk_free(tiny_split, home, monkeypatch):
+def test_a_fetch_leaves_some_of_the_disk_free(tiny_split, home, web, monkeypatch):
+    """Not even the begin of a download stays, which a later call would go on with."""
     free = shutil.disk_usage(tiny_split).free
     monkeypatch.setattr(fetching, "SPARE_BYTES", 2 * free)
-    with pytest.raises(OutputError, match=r"would leave less than \d+ bytes of disk free"):
-        fetch(str(tiny_split))
-    assert not list(home.rglob("*.h5*"))
+    pack(tiny_split, web.root / "tiny.tar")
+    for source in (str(tiny_split), f"{web.address}/tiny.tar"):
+        with pytest.raises(OutputError, match=r"would leave less than \d+ bytes of disk free"):
+            fetch(source)
+        assert not list(home.rglob("*.h5*"))
+        assert not list(home.rglob("archive"))
 
 
 @pytest.mark.parametrize("name", ["x.tar", "x.tar.gz", "x.zip"])
