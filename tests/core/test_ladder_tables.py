@@ -325,6 +325,21 @@ def test_thresholds_without_a_common_scale_have_no_mean_but_relative_to_a_refere
         assert math.isnan(Results(records).thresholds()[0]["kept99"]) == (not scaled)
 
 
+def test_one_place_without_a_scale_leaves_thresholds_without_a_mean():
+    """Rungs of the ladder in hopper; in the tank they have no strength that costs 1 %."""
+    known = at("rf", ("hopper", "iid"), dict(zip(TIMES, (0, 0.25, 0.5, 1), strict=True)))
+    assert Strengths.of(known).scaled
+    names = zip(own("rf", (0, 1, 1, 1)), ("4th", "kept90", "kept75", "kept50"), strict=True)
+    tank = [dataclasses.replace(r, strength=name) for r, name in names]
+    both = Strengths.of([*known, *tank])
+    assert both.calibrated
+    assert not both.scaled
+    first = StrengthTables(Board([*known, *tank])).overview()[0]
+    assert first.title.endswith("each in its own unit")
+    assert "threshold" not in first.header
+    assert first.rows == [["rf", "40", "0.224"]]
+
+
 def test_environments_without_a_common_scale_have_a_column_each():
     records = [*own("rf", (0, 1, 1, 1)), *own("rf", (0, 0, 1, 1), environment="pool")]
     table = StrengthTables(Board(records), units={"gravity": "g"}).overview()[0]

@@ -553,6 +553,53 @@ def test_a_difference_over_other_cells_than_the_tables_is_said_to_be():
     assert verdict_of(Board(rows(**values))).endswith("behind rf in matched AUC.")
 
 
+def test_rows_that_learn_from_failures_are_a_band_of_their_own():
+    """They stand below the others, however good, and verdicts compare rows of one band."""
+    ranked = rows(mewma=BASE, rf=RAISED)
+    taught = rows(a=[v + 0.3 for v in BASE], b=[v + 0.4 for v in BASE])
+    taught = [replace(r, training="failures") for r in taught]
+    for mine, text in (
+        (ranked[0], "mewma is second of two ranked rows, 10.0 points [10.0, 10.0] behind rf in"),
+        (ranked[1], "rf is first of two ranked rows, 10.0 points [10.0, 10.0] ahead of mewma in"),
+        (taught[0], "a is second of two rows that learn from failures, 10.0 points [10.0, 10.0]"),
+    ):
+        records = [mine, *(r for r in [*taught, *ranked] if r is not mine)]
+        (section,) = Report(records).sections
+        assert section.verdict.startswith(text)
+        for table in (t for t in section.tables if t.header[0] == "detector"):
+            names = [row[0].split()[0] for row in table.rows]
+            assert names == ["rf", "mewma", "b", "a"], table.title
+        by_anomaly = [t.title.partition(":")[0] for t in section.tables if "by anomaly" in t.title]
+        assert by_anomaly in ([], ["rf", "mewma", "b", "a"])
+
+
+def test_equal_rows_are_not_told_apart_and_none_is_behind():
+    text = verdict_of(Board(rows(rf=BASE, mewma=BASE)))
+    assert text.startswith("rf is second of two and cannot be told from mewma: 0.0 points [0.0, 0.")
+    for metric in ("auc_matched", "delay_censored_at_5pct"):
+        assert compare_rows(
+            rows(metric, rf=BASE, mewma=BASE), "rf", "mewma", metric
+        ).first_is_better
+
+
+def test_an_interval_has_digits_until_both_of_its_ends_are_told_from_zero():
+    assert with_interval(0.002, 0.0004, 0.0036, "auc") == "0.20 points [0.04, 0.36]"
+    assert with_interval(-0.002, -0.0036, -0.0004, "auc") == "-0.20 points [-0.36, -0.04]"
+    assert with_interval(0.001, -0.0004, 0.0036, "auc") == "0.1 points [0.0, 0.4]"
+
+
+def test_the_worst_place_is_the_one_with_the_lowest_mean():
+    means = {"ant": 0.7, "hopper": 0.9, "cartpole": 0.6}
+    records = [make_record("rf", e, values={"auc_matched": [v] * 2}) for e, v in means.items()]
+    records += [make_record("pe", e, values={"auc_matched": [1 - v] * 2}) for e, v in means.items()]
+    front = Tables(Board(records)).headline()
+    column = front.header.index("worst environment")
+    assert [row[column] for row in front.rows] == ["cartpole 60.0", "hopper 10.0"]
+    for environments in (["ant", "hopper"], ["ant"]):
+        of_some = Tables(Board([r for r in records if r.environment in environments])).headline()
+        assert ("worst environment" in of_some.header) == (len(environments) > 1)
+
+
 FLAT = {"auc_matched": [0.5] * 12}
 
 

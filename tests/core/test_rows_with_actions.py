@@ -129,6 +129,13 @@ def test_a_detector_that_looks_at_its_own_actions_alone_is_not_named(monkeypatch
     assert not plan_of(["mine"]).notes
 
 
+def test_a_detector_with_a_row_for_actions_has_declared_them(monkeypatch, tmp_path):
+    """Where both rows are named, the one without actions runs as it is."""
+    code = READS.replace('Mine, "")', 'Mine, "", with_actions="declares")')
+    install(monkeypatch, tmp_path, "mine", code)
+    assert not plan_of(["mine", "declares"]).notes
+
+
 def test_logs_without_actions_have_none_to_declare(monkeypatch, tmp_path):
     install(monkeypatch, tmp_path / "plugin", "mine", READS)
     assert not plan_of(["mine"], bare_split(tmp_path), ["bench"]).notes

@@ -211,6 +211,32 @@ def test_a_calibration_goes_on_where_it_was_interrupted(measured):
     assert calls == []
 
 
+def test_losses_grow_from_the_nominal_ones_of_each_kind(measured, monkeypatch):
+    """They count from the onset, which differs by kind, so each kind has its own nominal losses."""
+    go, calls, place = measured
+    loss = {"iid": 40.0, "bias": 10.0}
+
+    def measure(environment, kind, strength, twins, *, whole=False):
+        assert (kind, strength) not in calls
+        calls.append((kind, strength))
+        return [-loss[kind] * (1 + strength / 0.2)] * len(twins)
+
+    monkeypatch.setattr(calibrate, "measure", measure)
+    monkeypatch.setattr(calibrate, "has_loss", lambda _: True)
+    entries = go([*loss])
+    for kind in loss:
+        assert next(s for k, s in calls if k == kind) == 0.0
+        rungs = entries[kind]["rungs"]
+        assert rungs["loss10"]["kept"] == pytest.approx(0.9, abs=0.02)
+        assert rungs["loss10"]["strength"] == pytest.approx(0.02, rel=0.2)
+        assert rungs["loss100"]["strength"] == pytest.approx(0.2, rel=0.2)
+    lines = [json.loads(line) for line in (place / "work.jsonl").read_text().splitlines()]
+    assert {line["kind"] for line in lines} == {*loss}
+    calls.clear()
+    assert go([*loss]) == entries
+    assert calls == []
+
+
 def test_seeds_that_workers_share_out_stay_in_their_order(measured):
     go, calls, place = measured
     strengths, work = go(["iid", "bias"]), (place / "work.jsonl").read_text()

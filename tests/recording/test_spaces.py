@@ -1,6 +1,7 @@
 """Names of environments and kinds of plug-ins have spaces: no clash breaks a plug-in."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
@@ -160,6 +161,27 @@ def test_kinds_for_an_environment_are_of_the_one_beside_them(two, capsys):
     assert "unknown anomaly that cartpole can have" in capsys.readouterr().err
     assert build("mine", "--env", "cartpole", "--strength", "three/payload=0.5") == 4
     assert "unknown anomaly 'three/payload'" in capsys.readouterr().err
+
+
+def test_a_kind_may_be_for_an_environment_of_another_plugin_by_its_long_name(two):
+    """A short name in `environments` means the plug-in's own; a long one whoever has it."""
+    offered = discover().custom_specs
+    (tank,) = offered.named("two/tank", registry.EnvironmentSpec)
+    (kind,) = offered.named("one/payload", registry.AnomalySpec)
+    assert kind.environments == ("tank",)
+    assert not offered.is_for(kind, "one", tank)
+    assert offered.is_for(replace(kind, environments=("two/tank",)), "one", tank)
+    assert not offered.is_for(replace(kind, environments=("worlds/tank",)), "one", tank)
+    assert offered.is_for(replace(kind, environments=()), "one", tank)
+
+
+def test_a_broken_plugin_hides_nothing_of_another_with_the_same_name(two):
+    """Two distributions may name their plug-ins alike: what is there has its long name."""
+    offered = discover().custom_specs
+    beside = type(offered)(offered.specs, {"one": "'one' of elsewhere: no module"})
+    assert [spec.name for spec in beside.meanings("one/tank")] == ["tank"]
+    with pytest.raises(PluginError, match="elsewhere"):
+        beside.meanings("one/pool")
 
 
 GENERAL = """
