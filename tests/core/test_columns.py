@@ -161,8 +161,8 @@ def test_what_is_said_of_a_split_tells_scores_from_sensors(scored, monkeypatch, 
     monkeypatch.setenv("OODD_EVAL_DATA", str(scored.path.parent))
     assert main(["info", "arm"]) == 0
     out = capsys.readouterr().out
-    assert re.search(r"^3 sensors +q0 \(rad\)$", out, re.MULTILINE)
-    assert re.search(r"^5 scores +pos_innov\[0\] \(1\)$", out, re.MULTILINE)
+    assert re.search(r"^3 sensors +q0 \(rad\), q1 \(rad\), q2 \(rad\)$", out, re.MULTILINE)
+    assert re.search(r"^5 scores +pos_innov\[0\] \(1\), pos_innov", out, re.MULTILINE)
     assert re.search(r"^failures +3 episodes$", out, re.MULTILINE)
     assert main(["list", "envs"]) == 0
     assert re.search(
