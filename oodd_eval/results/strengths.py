@@ -239,14 +239,15 @@ def curve(records: Sequence[Record], metric: str) -> list[Point]:
         Name of a metric of the catalogue.
     """
     strengths, points = Strengths.of(records), []
+    scaled = strengths.scaled
     for name in strengths.names:
         cells = [r for r in strengths.at(records, name) if r.ok]
         rungs = {_pair(r): strengths.rungs[_pair(r)][r.strength] for r in cells}
         one_kind = len({kind for _, kind in rungs}) == 1
         logs = [
-            math.log(rung.strength / (strengths.unit(pair) if strengths.scaled else 1))
+            math.log(rung.strength / (strengths.unit(pair) if scaled else 1))
             for pair, rung in rungs.items()
-            if rung.strength > 0 and (strengths.scaled or one_kind)
+            if rung.strength > 0 and (scaled or one_kind)
         ]
         lost = nan_mean(1 - rung.kept for rung in rungs.values())
         value = mean_over_cells((r.seed, r.value(metric)) for r in cells)
