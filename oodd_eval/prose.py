@@ -19,8 +19,8 @@ class Table:
     """A titled table of texts, the first `labels` columns set to the left, with a note below it.
 
     On a terminal each row has the colour of its position in `colours`, if there are any. A table
-    that is too wide has headings and labels of several lines. If it still is, one that is `whole`
-    gives way to the first of `narrower` that fits, and then loses its intervals from the right;
+    that is too wide has headings and labels of several lines. If it still is, an `undivided`
+    one gives way to the first of `narrower` that fits, and then loses its intervals from the right;
     any other comes in parts of its columns.
     """
 
@@ -30,7 +30,7 @@ class Table:
     labels: int = 1
     note: str = ""
     colours: Sequence[str] = ()
-    whole: bool = False
+    undivided: bool = False
     narrower: Sequence["Table"] = ()
 
     @property
@@ -149,7 +149,7 @@ def _lines_of(table: Table) -> list[str]:
 def _fitting(table: Table, width: int) -> list[Table]:
     """Return what of a table fits: its first shape that does, or parts of its columns."""
     shapes = [table, *table.narrower]
-    if table.whole:  # intervals lose their spaces, and at last one after the other goes
+    if table.undivided:  # intervals lose their spaces, and at last one after the other goes
         last, columns = shapes[-1], range(shapes[-1].labels, len(shapes[-1].header))
         shapes = [s for t in shapes for s in (t, _cut(t, t.labels, r"(\[\S+), ", r"\1,"))]
         shapes += [_cut(last, i, r" \[[^\]]*\]", "") for i in reversed(columns)]
@@ -160,7 +160,7 @@ def _fitting(table: Table, width: int) -> list[Table]:
     for column in range(shape.labels, len(shape.header)):
         wider = [*parts[-1], column]
         fits = len(_lines_of(shape.columns(wider))[0]) <= width
-        if shape.whole or fits or parts[-1] == labels:
+        if shape.undivided or fits or parts[-1] == labels:
             parts[-1] = wider
         else:
             parts.append([*labels, column])
@@ -184,11 +184,11 @@ def _wrapped(table: Table, width: int) -> Table:
     header = [_lines(text, n) for text, n in zip(table.header, room, strict=True)]
     sizes = [*map(len, _lines_of(replace(table, header=header))[0].split())]
     for i in sorted(range(table.labels), key=sizes.__getitem__, reverse=True):
-        # Of a whole table labels get what other columns leave, but no word is divided for them.
+        # In an undivided table labels get what is left, but no word is divided for them.
         pieces = [len(piece) for text in columns[i] for piece in _PARTS.split(text) if piece]
         left = width - sum(sizes) + sizes[i] - 2 * (len(sizes) - 1)
         least = min(max(pieces, default=0), width // 3)
-        sizes[i] = min(sizes[i], max(left, least) if table.whole else width // 3)
+        sizes[i] = min(sizes[i], max(left, least) if table.undivided else width // 3)
         columns[i] = [_lines(text, sizes[i]) for text in columns[i]]
     return replace(table, header=header, rows=[[*row] for row in zip(*columns, strict=True)])
 

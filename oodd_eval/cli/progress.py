@@ -1,4 +1,4 @@
-"""How far a command is whose work has parts: a bar, or a line now and then."""
+"""Progress of a command whose work has parts: a bar, or a line now and then."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -14,8 +14,8 @@ from oodd_eval.scoring.display import SILENCE, Pace
 def pace_shown(noun: str, *, quiet: bool) -> Iterator[Callable[[int, int, str], None]]:
     """Show how much is done and the time left: a bar on a terminal, else a line now and then.
 
-    What it gives is called with the parts done, all parts and a word on the last one, which is
-    empty where parts were done before.
+    The block gets a function of the parts done, of all parts and of a word on the last one, which
+    is empty where parts were done before.
     """
     console, latest = make_console(quiet=quiet), -SILENCE
     pace = Pace(0, time.perf_counter(), noun=noun)

@@ -354,7 +354,7 @@ WORLDS: Final = ("arm", "drone", "tank")
 """Environments of the plug-in `oodd_worlds`, of which splits are published, too."""
 
 LONG_NAMES: Final = MappingProxyType({name: f"worlds/{name}" for name in WORLDS})
-"""What short names mean in the definitions of published splits and seasons."""
+"""Long names of the environments that published splits and seasons call by short ones."""
 
 
 def short_name(name: str) -> str:

@@ -1,4 +1,4 @@
-"""What plug-ins offer to record, and what its names mean.
+"""Environments and kinds of anomalies of plug-ins, and the meaning of their names.
 
 An environment or a kind of anomaly has a long name, ``PLUGIN/NAME``, that nothing else has, and a
 short one, which means something where one plug-in alone offers it. In a command, as in a split, a

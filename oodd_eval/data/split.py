@@ -322,8 +322,8 @@ class Split:
                 "some to evaluate detectors on: import them, or fit a watchdog on what there is"
             )
         long = [self.long_name(e, name) for e in selected for name in self._names(e)]
-        chosen = select("anomaly", anomalies, [*anomaly_names, *long])
-        return selected, list(dict.fromkeys(map(short_name, chosen)))
+        kinds = select("anomaly", anomalies, [*anomaly_names, *long])
+        return selected, list(dict.fromkeys(map(short_name, kinds)))
 
     def _names(self, *environments: str) -> tuple[str, ...]:
         conditions = in_suite_order(c for e in environments for c in self.conditions(e))

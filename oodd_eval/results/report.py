@@ -151,7 +151,7 @@ def _narrowing(table: Table) -> Table:
     few = range(2, len(kept) + 1) if len(kept) < len(table.header) else ()
     shorter = [table.columns([*kept[:2], *kept[i:]]) for i in few]
     note = f"{'. '.join(table.note.split('. ')[:2]).removesuffix('.')}."
-    return replace(table, whole=bool(few), narrower=shorter, note=note)
+    return replace(table, undivided=bool(few), narrower=shorter, note=note)
 
 
 def findings_of(board: Board, level: str = "") -> list[str]:

@@ -83,7 +83,7 @@ class PairedComparison:
 
     @property
     def first_is_better(self) -> bool:
-        """Whether the first row has the better mean, or both have the same."""
+        """True if the first row has the better mean, or both have the same."""
         return self.difference == 0 or (
             (self.difference < 0) == (metric_info(self.metric).better == "lower")
         )
@@ -246,8 +246,8 @@ def own_row(board: Board) -> Setting:
     """
     plugins = {r.setting: r.plugin for r in board.records}
     shipped = {row for row, name in plugins.items() if name.startswith(f"{SHIPPED}:")}
-    others = (row for row in best_first(board) if row not in shipped or ":" in row.detector)
-    return next(others, board.entries[0])
+    foreign = (row for row in best_first(board) if row not in shipped or ":" in row.detector)
+    return next(foreign, board.entries[0])
 
 
 def verdict_of(board: Board, level: str = "") -> str:

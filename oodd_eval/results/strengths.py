@@ -96,7 +96,7 @@ class Strengths:
 
     @property
     def scaled(self) -> bool:
-        """Whether the strengths of all pairs have a common scale, that of `unit`."""
+        """True if the strengths of all pairs have a common scale, that of `unit`."""
         return not any(math.isnan(self.unit(pair)) for pair in self.rungs)
 
     def chosen(self, name: str) -> dict[Pair, str]:
@@ -440,7 +440,7 @@ class StrengthTables:
 
     @property
     def _apart(self) -> bool:
-        """Whether a strength of one kind says nothing of the same number of another."""
+        """True if equal strengths of two kinds cannot be compared."""
         kinds = {kind for _, kind in self.strengths.rungs}
         return not self.strengths.calibrated and len(kinds) > 1
 

@@ -190,7 +190,7 @@ class Tables:
             replace(
                 self.table(title[0].upper() + title[1:], columns),
                 note=note,
-                whole=not self.intervals,
+                undivided=not self.intervals,
             )
             for columns in ([*first, *one_each, *alarms], [*first, *alarms])
         )

@@ -243,9 +243,9 @@ def calibrate(options: Options) -> int:
         offered = discovered(options).custom_specs
         environments = offered.select_environments(options.env)
         environments = offered.register(environments, [] if kinds == ["all"] else kinds)
-    known = [spec.name for spec in registered() if isinstance(spec, AnomalySpec)]
+    kind_names = [spec.name for spec in registered() if isinstance(spec, AnomalySpec)]
     work = options.work or options.output.with_name(options.output.name + ".work")
-    selected = select("anomaly", ",".join(map(short_name, kinds)), known)
+    selected = select("anomaly", ",".join(map(short_name, kinds)), kind_names)
     with pace_shown("evaluations", quiet=options.verbosity < 0) as progress:
         strengths = find_strengths(
             options.output,
