@@ -109,11 +109,11 @@ def _group(entry: tuple[str, Offer]) -> tuple[object, ...]:
 
 
 def _origin(offer: Offer) -> str:
-    """Return whose a detector is: first author and year of a shipped one, else its distribution."""
+    """Return the distribution of a detector, or the paper that a shipped one is after."""
     if offer.distribution != "oodd-eval":
         return offer.origin
     source = re.search(r"([A-Z][\w-]+).*?\((\d{4})\)", offer.spec.reference)
-    return " ".join(source.groups()) if source else "trivial"
+    return f"after {' '.join(source.groups())}" if source else "trivial"
 
 
 def _splits() -> Rows:

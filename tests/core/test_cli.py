@@ -396,8 +396,8 @@ def test_lists_begin_with_what_a_newcomer_needs(run, plugin):
     rows = [line.split(maxsplit=1) for line in run("list", "detectors")[1].splitlines()]
     assert rows[0][0] == "zzz"  # of somebody's own plug-in
     whose = {name: rest.partition("  ")[0] for name, rest in rows}
-    assert whose["riqn"] == whose["rf"] == "Danesh 2021"
-    assert whose["tdqc"] == "Francis-Meretzki 2026"
+    assert whose["riqn"] == whose["rf"] == "after Danesh 2021"
+    assert whose["tdqc"] == "after Francis-Meretzki 2026"
     assert whose["clock"] == "trivial"
     order = [name for name, _ in rows]
     assert order.index("riqn") < order.index("clock") < order.index("tdqc") < order.index("oracle")
