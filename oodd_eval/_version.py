@@ -1,6 +1,6 @@
 """The distribution's version, which the build reads, and the address of its repository."""
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 
 def repository() -> str:
