@@ -1,8 +1,11 @@
 """A season from nothing to its records: complete, resumable, and the same for the same bits."""
 
 import dataclasses
+import importlib.util
 import shutil
+from pathlib import Path
 
+import h5py
 import pytest
 from helpers_processes import Cluster, environment, oodd_eval, wait_until
 from oodd_leaderboard.season_files import read_season, row_path, write_season
@@ -72,6 +75,23 @@ def test_a_whole_season_has_a_page_and_a_site(whole):
     assert "no board" in page  # a trial
     assert all(name in page for name in (*ROWS, "short", BITS))
     assert (whole / "site" / "index.html").is_file()
+
+
+def test_columns_computed_from_score_files_are_those_of_the_board(whole, tmp_path):
+    path = Path(__file__).parents[2] / "benchmarks/season_columns.py"
+    spec = importlib.util.spec_from_file_location("season_columns", path)
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    # At 10 % the calibration is enough for each row.
+    assert script.main([str(whole), "--level", "10"]) == 0
+    assert script.main([str(whole), "random"]) == 0
+    changed = shutil.copytree(whole, tmp_path / "changed")
+    for file in (changed / "work/random/scores").glob("*.h5"):
+        with h5py.File(file, "r+") as scores:
+            part = scores["test/nominal/scores"]
+            part[:] = part[:] + 1e-3
+    assert script.main([str(changed), "mewma"]) == 0
+    assert script.main([str(changed), "random"]) == 1
 
 
 def test_what_fails_is_the_reason_of_a_row(whole):
