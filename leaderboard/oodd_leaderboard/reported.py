@@ -8,7 +8,7 @@
     records.jsonl    one record a line, as in a results directory
     curves.json      illustrations computed from the scores (optional)
 
-Records or curves of more than a megabyte are compressed: ``records.jsonl.xz``, ``curves.json.xz``.
+Records or curves of more than 100 kB are compressed: ``records.jsonl.xz``, ``curves.json.xz``.
 They are strangers' files: read within bounds and held to the rules of `oodd_leaderboard.formats`.
 """
 

@@ -27,7 +27,7 @@ XZ: Final = ".xz"
 PACKED: Final = (XZ, GZIP)
 """Endings of compressed files. New ones are by xz, which takes half of the room; both are read."""
 
-COMPRESSED_FROM: Final = 10**6  # bytes; smaller files stay readable in a pull request
+COMPRESSED_FROM: Final = 10**5  # bytes; smaller files stay readable in a pull request
 MAX_BYTES: Final = 64 * 10**6  # most bytes that a compressed file may decompress to
 MAX_TEXT: Final = 2**30  # most bytes of a file of text
 _MEMORY: Final = 128 * 2**20  # bytes that decompressing may need: twice what xz -9 asks for
@@ -284,7 +284,7 @@ def compress_large(path: Path) -> Path:
     if path.stat().st_size <= COMPRESSED_FROM:
         return path
     target = path.with_name(path.name + XZ)
-    write_bytes(target, lzma.compress(path.read_bytes()))
+    write_bytes(target, packed(target, path.read_bytes()))
     path.unlink()
     return target
 

@@ -8,6 +8,7 @@ from helpers_docs import parse
 
 from oodd_eval import load_split
 from oodd_eval.data.facts import ENVIRONMENTS, PROTOCOL, TABLE1
+from oodd_eval.data.files import read_text
 from oodd_eval.names import expression
 from oodd_eval.results.board import Conditions
 from oodd_eval.results.comparison import MEANINGS, read_record_set, write_reference
@@ -16,8 +17,8 @@ ROOT = Path(__file__).parents[2]
 DOCUMENT = (ROOT / "docs/regression-checks.md").read_text()
 CHECK = (ROOT / ".ci/run").read_text()
 REFERENCES = {
-    "mini.jsonl": ("rf[h=1,seed=0]",),
-    "quick.jsonl": (
+    "mini.jsonl.xz": ("rf[h=1,seed=0]",),
+    "quick.jsonl.xz": (
         "npn[h=1,seed=0,members=1,updates=250]",
         "riqn[h=1,seed=0,members=1,updates=250]",
         "pe-a[h=1,seed=0,updates=900]",
@@ -50,7 +51,7 @@ def test_the_references_of_this_project_are_of_the_split_that_ships(name):
 def test_the_reference_of_whole_forests_is_of_the_committed_records(tmp_path):
     records = read_record_set(ROOT / "leaderboard/results/paper-mini").records
     write_reference([r for r in records if "::rf[h=1,seed=0]" in str(r.cell)], tmp_path / "r.jsonl")
-    assert reference("mini.jsonl").read_bytes() == (tmp_path / "r.jsonl").read_bytes()
+    assert read_text(reference("mini.jsonl.xz")) == read_text(tmp_path / "r.jsonl")
 
 
 def own_check():
