@@ -6,8 +6,8 @@ second call goes on where the first was interrupted. ``oodd-eval compare DIR --w
 makes of the results the records that are committed in ``leaderboard/suites/logs``.
 
 Without ``--root`` the page is filled: cards from the comments of the recipes, and which part of a
-set the committed records are of, and which release made them, from ``sets.toml`` beside them. With
-``--check`` it is compared and not written. ``docs/figures/tables.py`` fills its two tables.
+set the committed records are of, from ``sets.toml`` beside them. With ``--check`` it is compared
+and not written. ``docs/figures/tables.py`` fills its tables.
 """
 
 import argparse
@@ -25,6 +25,8 @@ from oodd_logs.shipped_recipes import shipped_recipes
 
 from oodd_eval import evaluate
 from oodd_eval.errors import PromiseWarning
+from oodd_eval.plugins.discovery import discover
+from oodd_eval.results.board import boards
 from oodd_eval.results.directory import ResultsDirectory
 from oodd_eval.scoring.promises import promises_of
 
@@ -32,20 +34,22 @@ ROOT = Path(__file__).parents[1]
 PAGE, RECORDS = ROOT / "docs" / "public-logs.md", ROOT / "leaderboard" / "suites" / "logs"
 
 SETS = tomllib.loads((RECORDS / "sets.toml").read_text(encoding="utf-8"))
-"""The part of each set that the committed records are of, and their release."""
+"""The part of each set that the committed records are of."""
 
 ORDER = ("skab", "alfa", "rosa", "tep", "cwru", "nab", "ur3", "uci", "lerobot", "pi0")
 """Sets in the order of the page: labelled rows first, outcomes last."""
 
-DETECTORS = (
-    "panel", "pe", "riqn", "riqn-r", "n-riqn", "npn", "rf", "rf-ewma", "mewma", "knn", "pca",
-    "deedee", "logpzo", "paano", "rnd", "mahalanobis", "manifold", "range", "persistence", "clock",
-    "comb", "random",
-)  # fmt: skip
-WITH_ACTIONS = ("panel-a", "pe-a", "mewma-a", "logpzo-a", "rpt-a", "wm-kl-a")
-"""Shipped rows; the latter where a set has actions."""
-
 SEEDS = (0, 1, 2)
+
+
+def shipped_rows():
+    """Return the names of the detectors of this package that learn from nominal logs alone.
+
+    At one step `riqn-ms` is `riqn`.
+    """
+    offers = discover().offers.items()
+    ours = {n: o.spec for n, o in offers if o.distribution == "oodd-eval" and n != "riqn-ms"}
+    return [name for name, spec in ours.items() if spec.training == "nominal"]
 
 
 def card(name):
@@ -94,7 +98,9 @@ def run(name, root, detectors, results):
     # Windows of one length are no shorter in one part than in another.
     findings = [f for f in promises_of(data) if not (f.subject == "length" and f.p == 1)]
     doubts = "\n".join(f"- {_promise(finding)}." for finding in findings)
-    names = [n for n in detectors if n not in WITH_ACTIONS or data.actions]
+    plugins = discover()
+    with_actions = {n for n in detectors if "actions" in plugins.offer(n).spec.inputs}
+    names = [n for n in detectors if n not in with_actions or data.actions]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PromiseWarning)  # the lines above say it
         records = evaluate(names, split, seed=SEEDS, output=results)
@@ -103,18 +109,21 @@ def run(name, root, detectors, results):
     return f"{imported} `{split.digest[:12]}`.\n\n{doubts}"
 
 
-def sources(records):
-    """Return which part of each set the records are of, and where its table is, by its name."""
+def sources(records, page):
+    """Return which part of each set the records are of, and where its table is, by its name.
+
+    A digest that the page does not say of what was imported is of another recipe.
+    """
     sets = {Recipe.load(path).environment: name for name, path in shipped_recipes().items()}
-    digests = {sets[record.environment]: record.split_digest for record in records}
     lines = dict.fromkeys(ORDER, "No table: its files were not at hand.")
-    for name, digest in digests.items():
-        of = SETS[name]
-        release = of["release"] + (f", whose recipe had {of['recipe']}" if "recipe" in of else "")
+    for board in boards(records):
+        name, digest = sets[board.environments[0]], board.digest[:12]
+        releases = " and ".join(sorted({r.provenance["oodd_eval"] for r in board.records}))
+        recipe = "" if f"episodes; digest `{digest}`" in page else " and an earlier recipe"
         table = f"../leaderboard/README.md#public-logs-split-{name}-protocol-3"
         lines[name] = (
-            f"[Table of all rows]({table}), computed on {of['part']}, by release {release}; digest "
-            f"`{digest[:12]}`."
+            f"[Table of all rows]({table}), computed on {SETS[name]['part']}, by release "
+            f"{releases}{recipe}; digest `{digest}`."
         )
     return lines
 
@@ -136,7 +145,7 @@ def main(arguments=None):
     parser.add_argument("--root", type=Path, help="folder with a folder of files for each set")
     parser.add_argument("--results", type=Path, help="with --root: where results are kept")
     parser.add_argument("--set", default=",".join(ORDER), help="names of recipes")
-    parser.add_argument("--detector", default=",".join(DETECTORS + WITH_ACTIONS))
+    parser.add_argument("--detector", default=",".join(shipped_rows()))
     parser.add_argument("--check", action="store_true", help="write nothing; 1 where it differs")
     options = parser.parse_args(arguments)
     if bool(options.root) != bool(options.results):
@@ -149,7 +158,7 @@ def main(arguments=None):
         imported = {n: run(n, options.root / n, detectors, options.results) for n in present}
         page = filled(before, imported=imported)
     else:
-        of = sources(ResultsDirectory(RECORDS).records()) if RECORDS.is_dir() else {}
+        of = sources(ResultsDirectory(RECORDS).records(), before) if RECORDS.is_dir() else {}
         page = filled(before, card={n: card(n) for n in names}, source=of)
     if options.check:
         return int(page != before)
