@@ -108,17 +108,14 @@ class Command(click.Command):
                 raise UsageError(f"two outputs are {str(path)!r}: {option} would replace the first")
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write arguments and options; the further ones where the context asks for all."""
+        """Write the options; the further ones where the context asks for all."""
         further = dict.fromkeys(self.further.values()) if ctx.meta.get(ALL) else ()
-        for heading in ("Positional arguments", "Options", *further):
-            params = (p for p in self.get_params(ctx) if self._heading(p) == heading)
-            if records := [r for p in params if (r := p.get_help_record(ctx))]:
+        options = [p for p in self.get_params(ctx) if isinstance(p, click.Option)]
+        for heading in ("Options", *further):
+            under = (p for p in options if self.further.get(p.opts[0], "Options") == heading)
+            if records := [r for p in under if (r := p.get_help_record(ctx))]:
                 with formatter.section(heading):
                     formatter.write_dl(records)
-
-    def _heading(self, param: click.Parameter) -> str:
-        is_option = isinstance(param, click.Option)
-        return self.further.get(param.opts[0], "Options") if is_option else "Positional arguments"
 
     def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the examples."""

@@ -558,7 +558,10 @@ def commands(group=cli.PROGRAM, context=None):
 
 def test_help_of_a_command_has_at_most_14_options_and_help_all_has_every_one():
     for command, context in commands():
-        brief = re.findall(r"^  (--?\w[\w-]*)", command.get_help(context), re.MULTILINE)
+        text = command.get_help(context)
+        has_arguments = any(isinstance(p, click.Argument) and p.help for p in command.params)
+        assert text.count("\nPositional arguments:\n") == has_arguments
+        brief = re.findall(r"^  (--?\w[\w-]*)", text, re.MULTILINE)
         assert len(brief) <= 14, context.command_path
         every = {p.opts[0] for p in command.get_params(context) if isinstance(p, click.Option)}
         assert {*command.further} <= every
