@@ -1,5 +1,6 @@
 """Entries: those of shipped rows agree with their detectors; strangers' are read strictly."""
 
+import hashlib
 from pathlib import Path
 
 import pytest
@@ -11,13 +12,14 @@ from oodd_eval.plugins.parameters import resolve_parameters
 from tests.helpers_docs import ROOT
 
 PLUGINS = discover()
-SHIPPED = read_entries(ROOT / "leaderboard/entries")
+ENTRIES = ROOT / "leaderboard/entries"
+SHIPPED = [entry for entry in read_entries(ENTRIES) if entry.shipped]
+STRANGERS = [entry for entry in read_entries(ENTRIES) if not entry.shipped]
 
 
 @pytest.mark.parametrize("entry", SHIPPED, ids=lambda entry: entry.name)
 def test_an_entry_of_a_shipped_row_agrees_with_its_detector(entry: Entry) -> None:
     spec = PLUGINS.offer(entry.detector).spec
-    assert entry.shipped
     assert entry.training == spec.training
     resolve_parameters(spec.name, spec.parameters, entry.parameters, others=spec.other_parameters)
     assert (entry.origin == "oracle") == (entry.training == "oracle")
@@ -31,6 +33,16 @@ def test_every_detector_that_the_package_ships_has_an_entry() -> None:
     specs = (offer.spec for offer in PLUGINS.offers.values())
     names = {spec.name for spec in specs if spec.training != "failures"}
     assert names <= {entry.detector for entry in SHIPPED}
+
+
+@pytest.mark.parametrize("entry", STRANGERS, ids=lambda entry: entry.name)
+def test_a_strangers_entry_names_its_authors_and_brings_its_wheel(entry: Entry) -> None:
+    assert entry.authors
+    assert entry.licence
+    assert entry.detector not in PLUGINS.offers
+    if entry.wheel:
+        content = (ENTRIES / entry.name / entry.wheel).read_bytes()
+        assert hashlib.sha256(content).hexdigest() == entry.sha256
 
 
 GOOD = 'requirement = "oodd-mine==1.2"\nsha256 = "{}"\nauthors = "A. Author"\n'
