@@ -64,8 +64,9 @@ def install(entry: Entry, directory: Path, target: Path) -> list[dict[str, str]]
     Raises
     ------
     InstallError
-        It is no wheel, or another one than the entry declares; it would replace something that is
-        installed here; it needs a file from a URL; it is too large; pip fails, or there is none.
+        It is no wheel, or another one than the entry declares; it is installed here, or would
+        replace something that is; it needs a file from a URL; it is too large; pip fails, or there
+        is none.
     PluginError
         Metadata that `check_packages` refuses.
     """
@@ -73,6 +74,12 @@ def install(entry: Entry, directory: Path, target: Path) -> list[dict[str, str]]
         return []
     if find_spec("pip") is None:
         raise InstallError(f"pip is missing: {sys.executable} -m ensurepip installs it")
+    installed = installed_versions()
+    if (held := installed.get(entry.distribution)) is not None:
+        raise InstallError(
+            f"{entry.distribution} {held} is installed here already: a season installs it by "
+            f"itself, so run `pip uninstall {entry.distribution}` first"
+        )
     with temporary_directory(target.parent, target.name) as work:
         requirement = _requirement(entry, directory, work)
         # To learn what a source distribution at a URL requires, pip would run code of it.
@@ -80,15 +87,13 @@ def install(entry: Entry, directory: Path, target: Path) -> list[dict[str, str]]
             _check_digest(entry, file.sha256)
             if direct := [r for r in file.requires if "@" in r.partition(";")[0]]:
                 raise InstallError(f"it requires {direct[0]!r:.200}, expected names of an index")
-        installed, files = installed_versions(), _files(work, requirement)
+        files = _files(work, requirement)
         for file in files:
             if (held := installed.get(normalized(file.distribution))) is not None:
                 raise InstallError(
                     f"{file.distribution} {file.version} would replace {held}, which is installed "
                     f"here: expected that {entry.distribution} works with that version"
                 )
-        if not files:
-            raise InstallError(f"{entry.distribution} is installed here already: uninstall it")
         hashed = (f"{file.url} --hash=sha256:{file.sha256}\n" for file in files)
         (work / "files.txt").write_text("".join(hashed))
         exactly = ("--no-deps", "--require-hashes", "--requirement", "files.txt")

@@ -100,6 +100,12 @@ def test_a_distribution_that_a_wheel_brings_along_is_refused(entry, refusal):
     assert "numpy 9 has the name of" in reason
 
 
+def test_a_wheel_of_what_is_installed_here_is_refused_with_the_way_out(entry, refusal):
+    reason = refusal(entry(name="pytest"))
+    assert f"pytest {pytest.__version__} is installed here already" in reason
+    assert "`pip uninstall pytest`" in reason
+
+
 MEMBERS = ("../oodd_mine.py", "a/../../b.py", "/etc/x", "a\\..\\b", "a\nb")
 
 

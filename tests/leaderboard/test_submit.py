@@ -45,7 +45,8 @@ def test_an_entry_has_wheel_digest_parameters_and_records(home, capsys):
     facts = {"authors": "A. Author", "paper": "A_title, *venue*", "licence": "MIT"}
     options = [text for name, value in facts.items() for text in (f"--{name}", value)]
     assert submit(results, "--detector", "mine", "--wheel", WHEEL, "--year", 2026, *options) == 0
-    assert "leaderboard season --entries" in " ".join(capsys.readouterr().out.split())
+    out = " ".join(capsys.readouterr().out.split())
+    assert "next: pip uninstall oodd-mine oodd-eval leaderboard season --entries" in out
     (entry,) = read_entries(home / "leaderboard" / "entries")
     assert read_entries(home / "leaderboard" / "entries" / "mine") == [entry]
     assert entry == Entry(

@@ -10,7 +10,7 @@ from oodd_eval.cli import DIRECTORY, FILE, OUTPUT_DIRECTORY, Options, command, s
 from oodd_eval.cli.console import make_console
 from oodd_eval.data.files import only_writer, temporary_directory
 from oodd_leaderboard import submit as submission
-from oodd_leaderboard.entry import ENTRY, Entry
+from oodd_leaderboard.entry import ENTRY, Entry, read_entry
 from oodd_leaderboard.pages import PARTS, STALE, differences, read_leaderboard, stale
 from oodd_leaderboard.pages import build as build_board
 
@@ -106,9 +106,11 @@ def submit(options: Options) -> int:
         console = make_console()
         console.print((path / ENTRY).read_text(encoding="utf-8"), markup=False, end="")
         size = sum(p.stat().st_size for p in path.rglob("*"))
+        entry = read_entry(path / ENTRY)
+        uninstall = "" if entry.shipped else f"  pip uninstall {entry.distribution}\n"
         console.print(
             f"\nwritten to {path}, {size / 1e6:.2g} MB; next:\n"
-            f"  oodd-eval leaderboard season --entries {path} --env cartpole "
+            f"{uninstall}  oodd-eval leaderboard season --entries {path} --env cartpole "
             "--train 12 --calibration 40 --test 4 --output my-season\n"
             f"  git add {path}\n"
             "commit it alone, and open a pull request (docs/submitting.md)",
