@@ -232,7 +232,7 @@ class DetectorSpec:
     factory
         Called as ``factory(seed=..., horizon=..., **parameters)``; returns an unfitted `Detector`.
         ``seed`` decides every random draw, ``horizon`` is the prediction horizon in steps. One that
-        does not take one of these two is called without it.
+        does not take one of these two is called without it, unless it takes ``**parameters``.
     summary
         One line for ``oodd-eval list``.
     reference
