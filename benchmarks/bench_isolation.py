@@ -3,14 +3,12 @@
 ``python benchmarks/bench_isolation.py [--rows] [DETECTOR ...]`` (default rf, npn and riqn, by rows
 mewma, pe, panel, rf and riqn) first fits and scores hopper of split mini, in turns, as a run does
 and with each part as one group: more forks and smaller batches come on top of the work itself. Then
-it streams 16 episodes into fresh sandboxes, one after the other and in lockstep, and says what a
-season takes by that in processor hours, without fits.
+it streams 16 episodes into fresh sandboxes, one after the other and in lockstep.
 Exit code 1 when the plain runs cost more than 10 % of all together, or lockstep costs more than
 one after the other.
 """
 
 import argparse
-import statistics
 import sys
 import time
 from contextlib import suppress
@@ -33,8 +31,6 @@ ROUNDS = 3
 PLAIN = ("rf", "npn", "riqn")
 STREAMED = ("mewma", "pe", "panel", "rf", "riqn")
 EPISODES, ROWS = 16, 101
-SEASON_ROWS, SEASON_UNITS, GROUPS = 34 * 10**6, 700, 9
-"""Of all shipped rows in ten environments with eight kinds each: a group for each test part."""
 
 
 def whole(sizes):
@@ -109,7 +105,7 @@ def streamed(request, state, group, streams):
 
 def streamed_rows(detectors):
     """Stream rows of one episode at a time and of all in lockstep; return the largest ratio."""
-    data, rows, seconds, ratios = load_split("mini").environment("hopper"), [], [], []
+    data, ratios = load_split("mini").environment("hopper"), []
     nominal = [x.without_actions() for x in data.train]
     group = [x.without_actions()[:ROWS] for x in data.calibration][:EPISODES]
     for detector in detectors:
@@ -118,16 +114,9 @@ def streamed_rows(detectors):
         assert all(a[2] == b[2] for a, b in turns), f"{detector}: other scores in lockstep"
         one, all_ = (min(turn[i][0] for turn in turns) for i in (0, 1))
         fresh = min(run[1] for turn in turns for run in turn)
-        rows.append(all_)
-        seconds.append(fresh)
         ratios.append(all_ / one)
         print(f"{detector}: {one:.0f} us a row by itself, {all_:.0f} us in lockstep, "
               f"{ratios[-1]:.2f}; {fresh:.2f} s for a fresh sandbox")  # fmt: skip
-    scoring = SEASON_ROWS * statistics.mean(rows) / 1e6 / 3600
-    sandboxes = SEASON_UNITS * GROUPS
-    starting = sandboxes * statistics.mean(seconds) / 3600
-    print(f"a season of {SEASON_ROWS / 1e6:.0f} million rows and {sandboxes} sandboxes: "
-          f"{scoring:.1f} h of scoring, {starting:.1f} h of starting, on one core")  # fmt: skip
     return max(ratios)
 
 

@@ -210,7 +210,9 @@ def main(arguments=None):
     parser.add_argument("--level", type=int, default=5, help="of alarms, in percent")
     options = parser.parse_args(arguments)
     season = read_season(options.season)
-    board = Board(season.records(options.season), season.expected)
+    if not (records := season.records(options.season)):
+        parser.error(f"{options.season} has no finished row")
+    board = Board(records, season.expected)
     finished = [entry.detector for entry in board.entries]
     if missing := [name for name in options.rows if name not in finished]:
         parser.error(f"no finished row {', '.join(missing)}, expected some of {finished}")
