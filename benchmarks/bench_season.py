@@ -3,8 +3,9 @@
 ``python benchmarks/bench_season.py TRIAL [--jobs 2]`` reads the directory of a ``leaderboard
 season`` with few environments or episodes that ran without a break, so many fits at a time. The
 seconds of a fit and of its streamed rows are those of the records. What is left of the time, by the
-dates of the row's files, is of its sandboxes. For a season fits count for all environments, with
-seconds in proportion to training episodes. Rows count for all episodes, as long as the trial's.
+dates of the row's files, is of its sandboxes, and of waiting on a busy machine. For a season fits
+count for all environments, with seconds in proportion to training episodes. Rows count for all
+episodes, as long as the trial's.
 """
 
 import argparse
