@@ -118,6 +118,8 @@ ENTRIES = {
     "broken": Entry("broken"),
 }  # fmt: skip
 
+SIZES = {"train": 60, "calibration": 80, "test": 12, "episode_cap": 300}
+
 CELLS = [(e, a) for e in ("cartpole", "hopper") for a in ("iid", "drift", "gravity", "components")]
 
 
@@ -152,7 +154,7 @@ def season(*, name="2026-11", date="2026-11-27", trial=False, cells=CELLS, rows=
         conditions.setdefault(environment, []).append(anomaly)
     about = Season(
         name=name, bits="0123456789abcdef" * 2, protocol=1, oodd_eval="0.3.0",
-        split=SeasonSplit(f"season-{name}", "5e" * 32, {}), seeds=[0, 1, 2],
+        split=SeasonSplit(f"season-{name}", "5e" * 32, SIZES), seeds=[0, 1, 2],
         environments=list(conditions), conditions=conditions, trial=trial, date=date,
         entries={row: ENTRIES[row] for row in rows},
         installed={"mine": [Installed("mine", "1.2", "12" * 32)]},

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
-from oodd_eval.data.facts import SPLITS
+from oodd_eval.data.facts import SPLITS, WORLDS
 from oodd_eval.data.files import PACKED, compress, decompress, write_bytes, write_text
 from oodd_eval.data.split import published_digests
 from oodd_eval.errors import ResultsError
@@ -36,6 +36,7 @@ from oodd_leaderboard.reported import (
     LeaderboardSection,
     SuiteSection,
     by_detector,
+    day_of,
     entries_of,
     read_reported,
     sections,
@@ -202,18 +203,21 @@ def page(leaderboard: Leaderboard, project: str = "../") -> str:
 def _season(board: SeasonBoard) -> str:
     season, ranks = board.season, board.ranks
     title = ", ".join(filter(None, [board.title, season.date])) + ": no board" * season.trial
-    seeds = ", ".join(map(str, season.seeds))
+    definition = season.split.definition
     facts = TEXTS["season"].format(
         bits=season.bits,
+        split=season.split.name,
         digest=season.split.digest,
         protocol=season.protocol,
         version=season.oodd_eval,
-        seeds=seeds,
-        environments=", ".join(season.environments),
+        seeds=", ".join(map(str, season.seeds)),
+        cap=definition["episode_cap"],
+        worlds=", in worlds their own length" * bool(set(WORLDS) & {*season.environments}),
         table=_csv(board),
+        **{name: definition[name] for name in ("train", "calibration", "test")},
     )
     facts = "\n".join(filter(None, [board.notice, facts]))
-    return _board(title, facts, ranks, season.entries, [TEXTS["legend"]])
+    return _board(title, facts, ranks, season.entries, [TEXTS["legend"]], board.drawn())
 
 
 def _reported(section: LeaderboardSection) -> str:
@@ -229,7 +233,12 @@ def _reported(section: LeaderboardSection) -> str:
 
 
 def _board(
-    title: str, facts: str, ranks: OrderedBoard, entries: Mapping[str, Entry], legend: Sequence[str]
+    title: str,
+    facts: str,
+    ranks: OrderedBoard,
+    entries: Mapping[str, Entry],
+    legend: Sequence[str],
+    *further: Table,
 ) -> str:
     """Return a board's part of the page: its rows, whose they are, failures, notes."""
     front = board_table(ranks)
@@ -237,7 +246,7 @@ def _board(
     body = Section(
         title,
         findings=[sentence for sentence in findings_of(ranks.board) if sentence not in counted],
-        tables=[t for t in (_authors(ranks, entries), tables.failures(ranks.board)) if t],
+        tables=[*filter(None, (tables.failures(ranks.board), *further, _authors(ranks, entries)))],
         notes=[*unranked(ranks), *tables.notes(ranks.board)],
     )
     parts = [
@@ -307,9 +316,12 @@ def _authors(ranks: OrderedBoard, entries: Mapping[str, Entry]) -> Table:
         paper = " ".join(filter(None, [row.paper, url]))
         whose = [ORIGINS[row.origin], row.authors, paper, str(row.year or "")]
         inputs = row.inputs.replace("observations+actions", "+actions")
-        lines.append([str(row.entry), *whose, inputs, str(row.seeds), " to ".join(ends)])
-    header = ["row", "whose", "authors", "paper", "year", "inputs", "seeds", "mean of a seed"]
-    return Table("Whose the rows are", header, lines, labels=6)
+        versions = ", ".join(dict.fromkeys(r.detector_version for r in row.records))
+        run = [versions, day_of(row.records), str(row.seeds)]
+        lines.append([str(row.entry), *whose, inputs, *run, " to ".join(ends)])
+    header = ["row", "whose", "authors", "paper", "year", "inputs"]
+    header += ["version", "run on", "seeds", "mean of a seed"]
+    return Table("Whose the rows are", header, lines, labels=8)
 
 
 def _suite(section: SuiteSection) -> str:

@@ -129,6 +129,12 @@ def by_detector(entries: Iterable[Entry]) -> dict[str, Entry]:
     return {entry.detector or entry.name: entry for entry in in_order}
 
 
+def day_of(records: Iterable[Record]) -> str:
+    """Return the day of the latest of some records; empty where none says it."""
+    times = (str(r.provenance.get("time", ""))[:10] for r in records)
+    return max(filter(re.compile(r"\d{4}-\d\d-\d\d").fullmatch, times), default="")
+
+
 TABLES: Final = "tables"  # directory of the CSV files
 SUITES: Final = "suites"  # directory of results on further test suites, one directory a split
 
@@ -156,8 +162,7 @@ class LeaderboardSection:
     @property
     def date(self) -> str:
         """The day of its latest record; empty where none says it."""
-        times = (str(r.provenance.get("time", ""))[:10] for r in self.ranks.board.records)
-        return max(filter(re.compile(r"\d{4}-\d\d-\d\d").fullmatch, times), default="")
+        return day_of(self.ranks.board.records)
 
     @property
     def order(self) -> tuple[int, str, int, int, str]:
@@ -199,10 +204,11 @@ def sections(
 ) -> list[LeaderboardSection]:
     """Sort reported records into tables of one split digest, protocol and limit each.
 
-    A row is of one directory, as nobody could tell whose numbers its means are: `ResultsError`
-    names two that have it. `entries` are by detector.
+    A row is of one directory, as nobody could tell whose numbers its means are, and has each cell
+    once: `ResultsError` names two that have it, or the cell. `entries` are by detector.
     """
     owners: dict[object, Reported] = {}
+    cells: set[object] = set()
     records: list[Record] = []
     for report in reported:
         for record in report.records:
@@ -212,6 +218,12 @@ def sections(
                     f"{owner.path} and {report.path} both hold row {str(record.setting)!r} of "
                     f"split digest {record.split_digest[:12]}, expected one: remove one of them"
                 )
+            if (cell := (row, record.cell)) in cells:
+                raise ResultsError(
+                    f"{report.path} holds {str(record.cell)!r} twice, expected one record: remove "
+                    "the older"
+                )
+            cells.add(cell)
             records.append(record)
     by_board = []
     for board in boards(records):

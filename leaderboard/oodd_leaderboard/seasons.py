@@ -1,11 +1,13 @@
 """Boards of seasons: read, refused where rows are incomplete, and ordered."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from oodd_eval.data.facts import ENVIRONMENTS, WORLDS
 from oodd_eval.errors import ResultsError
+from oodd_eval.prose import Table
 from oodd_leaderboard.season_files import SEASON, Season, read_season
 from oodd_leaderboard.standings import OrderedBoard, ordered
 
@@ -35,6 +37,21 @@ class SeasonBoard:
         """What a trial lacks, as a sentence; empty for a season."""
         return f"This trial lacks {' and '.join(self.lacks)}." if self.lacks else ""
 
+    def drawn(self) -> Table:
+        """Return which anomalies, with their strengths, the bits gave each environment."""
+        groups = self.ranks.board.groups
+        rows = []
+        for environment, conditions in self.season.conditions.items():
+            kinds = {text: text.partition("@")[0] for text in conditions}
+            of_groups = ([t for t in conditions if kinds[t] in groups[group]] for group in groups)
+            rows.append([environment, *map(", ".join, of_groups)])
+        note = (
+            "kept90 is the strength at which the policy keeps 90 % of its return, loss10 that at "
+            "which its task's loss grows by 10 %. Numbers stand in season.json."
+        )
+        header = ["environment", *groups]
+        return Table("Anomalies that were drawn", header, rows, labels=len(header), note=note)
+
 
 def read_season_board(directory: Path) -> SeasonBoard:
     """Read a season and order its rows.
@@ -62,7 +79,12 @@ def lacking(season: Season) -> list[str]:
 
 
 def read_seasons(leaderboard: Path) -> list[SeasonBoard]:
-    """Read the seasons of a leaderboard's directory, the newest first."""
+    """Read the seasons of a leaderboard's directory, in the order of `newest_first`."""
     paths = [path.parent for path in (leaderboard / SEASONS).glob(f"*/{SEASON}")]
-    seasons = map(read_season_board, sorted(paths))
-    return sorted(seasons, key=lambda board: board.season.date, reverse=True)
+    return newest_first(map(read_season_board, paths))
+
+
+def newest_first(seasons: Iterable[SeasonBoard]) -> list[SeasonBoard]:
+    """Return seasons by date, the newest first, and behind them trials."""
+    by_date = sorted(seasons, key=lambda s: (s.season.date, s.season.name), reverse=True)
+    return sorted(by_date, key=lambda s: s.season.trial)

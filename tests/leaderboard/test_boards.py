@@ -46,7 +46,10 @@ def test_a_page_says_who_is_first_when_and_by_whom(season, reported):
     head, _, rest = text.partition("## Season 2026-11, 2026-11-27")
     assert "No season" not in head
     board, _, below = rest.partition("## Reported rows")
-    assert f"Bits {season.season.bits}, split digest {season.season.split.digest}" in board
+    about = season.season
+    assert f"Bits {about.bits}, split {about.split.name}, digest {about.split.digest}" in board
+    assert "60 training and 80 calibration trajectories, and 12\ntest seeds" in board
+    assert re.search(r"\| cartpole +\| iid, drift +\| gravity, components +\|", board)
     assert "Best: riqn by Danesh, Fern (2021), matched AUC" in board
     assert "It is told from the second, mine: the difference is" in board
     assert "others, 2026" in board

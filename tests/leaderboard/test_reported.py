@@ -2,13 +2,14 @@
 
 import json
 import lzma
+import re
 from dataclasses import replace
 
 import pytest
 from helpers_records import example, make_record
 from oodd_leaderboard.entry import Entry
 from oodd_leaderboard.formats import check_record
-from oodd_leaderboard.pages import build, differences, read_leaderboard
+from oodd_leaderboard.pages import build, differences, page, read_leaderboard
 from oodd_leaderboard.reported import (
     MOST_PACKED,
     by_detector,
@@ -149,6 +150,23 @@ def test_a_row_is_of_one_directory(leaderboard):
     (other / "records.jsonl").write_text(make_record("riqn", "ant", seed=7).to_json() + "\n")
     with pytest.raises(ResultsError, match="both hold row 'riqn'"):
         sections(read_reported(leaderboard))
+
+
+def test_a_row_that_is_run_again_takes_the_place_of_the_older_one(leaderboard):
+    path = leaderboard / "entries/mine/records.jsonl"
+    older = path.read_text()
+    fresh = [json.loads(line) for line in older.splitlines()]
+    for record in fresh:
+        record |= {"detector_version": "9.9", "provenance": {"time": "2027-01-02T03:04:05+00:00"}}
+    again = "".join(json.dumps(record) + "\n" for record in fresh)
+    path.write_text(older + again)
+    with pytest.raises(ResultsError, match="twice, expected one record: remove the older"):
+        read_leaderboard(leaderboard)
+    path.write_text(again)
+    board = read_leaderboard(leaderboard)
+    assert [str(row.entry) for row in board.reported[0].ranks.standings].count("riqn") == 1
+    (line,) = re.findall(r"\| riqn .*\| 9\.9 .*", page(board))
+    assert [cell.strip() for cell in line.split("|")][7:9] == ["9.9", "2027-01-02"]
 
 
 def test_no_table_mixes_digests_protocols_or_limits(leaderboard):

@@ -11,6 +11,7 @@ import pytest
 from oodd_leaderboard import site
 from oodd_leaderboard.curve_file import read_curves
 from oodd_leaderboard.reported import REPORTED, sections
+from oodd_leaderboard.seasons import newest_first
 from oodd_leaderboard.site.content import (
     gridded,
     part_name,
@@ -106,7 +107,7 @@ def test_the_head_says_which_season_it_is_and_of_what_day(page, reported):
 def test_the_newest_season_is_first_then_trials_then_reported_tables(reported, season):
     older = helpers_site.season(name="2026-05", date="2026-05-20")
     trial = helpers_site.season(name="small", date="2026-12-01", trial=True)
-    data, _ = site_data(reported, (), [trial, older, season])
+    data, _ = site_data(reported, (), newest_first([trial, older, season]))
     assert [board["name"] for board in data["boards"]] == [
         "Season 2026-11", "Season 2026-05", "Trial small",
         "Reported: mini (abababab)", "Reported: mini (cdcdcdcd)",

@@ -39,7 +39,8 @@ from oodd_eval.results.strengths import COSTS, DETECTION, Strengths, curve
 from oodd_eval.results.tables import ALARMS_OF_OUTCOMES, PAPERS, POOLED, missing_level
 from oodd_leaderboard.curve_file import read_curves
 from oodd_leaderboard.entry import Entry
-from oodd_leaderboard.reported import REPORTED, LeaderboardSection, Reported, SuiteSection
+from oodd_leaderboard.reported import REPORTED, LeaderboardSection, Reported, SuiteSection, day_of
+from oodd_leaderboard.season_files import SPLIT
 from oodd_leaderboard.seasons import SeasonBoard
 from oodd_leaderboard.standings import OrderedBoard, Standing
 
@@ -57,6 +58,8 @@ ALL: Final = "*"  # all environments or anomalies; a group of anomalies is `*sen
 
 SUMMARIES: Final = tuple(f"{ALL}|{ALL}{group}" for group in ("", *GROUPS))
 """Selections of cells whose means stand in the index; other means are made from a part."""
+
+REBUILT: Final = "rebuilt"  # where the commands of the site record a season's split again
 
 ENTRY_FIELDS: Final = ("authors", "paper", "year", "url", "licence", "sha256")
 """Fields of an entry that the site shows."""
@@ -93,15 +96,9 @@ class _SiteBoard:
     sources: Mapping[Setting, Reported]
 
 
-def newest_first(seasons: Sequence[SeasonBoard]) -> list[SeasonBoard]:
-    """Return seasons by date, the newest first, and behind them trials."""
-    by_date = sorted(seasons, key=lambda s: (s.season.date, s.season.name), reverse=True)
-    return sorted(by_date, key=lambda s: s.season.trial)
-
-
 def season_line(seasons: Sequence[SeasonBoard]) -> str:
     """Return the sentence at the head of every page: the newest season, or that there is none."""
-    boards = [s.season for s in newest_first(seasons) if not s.season.trial]
+    boards = [s.season for s in seasons if not s.season.trial]
     if boards:
         return f"Season {boards[0].name}, {_day(boards[0].date)}."
     if seasons:
@@ -121,7 +118,7 @@ def site_data(
     sources = {source.name: source for section in sections for source in section.sources.values()}
     units = {name: read_curves(s.curves)["units"] for name, s in sources.items() if s.curves}
     parts: dict[str, Json] = {}
-    tables = [*map(_of_season, newest_first(seasons)), *_of_reported(sections)]
+    tables = [*map(_of_season, seasons), *_of_reported(sections)]
     boards = [_board(table, units, parts) for table in tables]
     names = dict.fromkeys(name for b in boards for name in (*b["metrics"], b["ranking"]))
     data = {
@@ -146,10 +143,12 @@ def _day(iso: str) -> str:
 def _of_season(board: SeasonBoard) -> _SiteBoard:
     season = board.season
     about = _fields(season, "bits", "seeds", "oodd_eval") | {
+        "drawn": _fields(board.drawn(), "title", "header", "rows", "note"),
+        "command": f"oodd-eval leaderboard season --bits {season.bits} --output {REBUILT}",
         "installed": {
             entry: [_fields(wheel, "distribution", "version", "sha256") for wheel in wheels]
             for entry, wheels in season.installed.items()
-        }
+        },
     }
     title = board.title + ": no board" * season.trial
     texts = (board.name, board.title, title, _day(season.date), board.notice)
@@ -328,7 +327,8 @@ def _row(
     part = {
         "version": records[0].detector_version,
         "parameters": records[0].parameters,
-        "command": _command(row, board, line["seeds"]),
+        "day": _day(day_of(records)),
+        "command": _command(table, row, line["seeds"]),
         "entry": _fields(entry, *ENTRY_FIELDS)
         | {"requirement": entry.wheel or entry.requirement, "reported": source and source.name},
         "values": [[_mean(of_cell, name) for of_cell in complete_cells] for name in names],
@@ -338,12 +338,18 @@ def _row(
     return line, part
 
 
-def _command(row: Setting, board: Board, seeds: Sequence[int]) -> str:
-    """Return the command that makes a row's records; nothing where others have not the split."""
-    if published_digests().get(board.split) != board.digest:
+def _command(table: _SiteBoard, row: Setting, seeds: Sequence[int]) -> str:
+    """Return the command that makes a row's records; nothing where others have not the split.
+
+    A season's split is recorded again by the season's command, and a row has its entry's name.
+    """
+    board, detector, split = table.ranks.board, row.detector, table.ranks.board.split
+    if table.season:
+        detector, split = table.entries[detector].detector or detector, f"{REBUILT}/{SPLIT}"
+    elif published_digests().get(split) != board.digest:
         return ""
-    words = ["--detector", row.detector, "--env", ",".join(board.environments)]
-    words += ["--split", board.split, "--seed", ",".join(map(str, seeds))]
+    words = ["--detector", detector, "--env", ",".join(board.environments)]
+    words += ["--split", split, "--seed", ",".join(map(str, seeds))]
     words += ["--horizon", str(row.horizon)] * (row.horizon != 1)
     words += ["--limit", str(board.limit)] * (board.limit is not None)
     for name, value in row.overrides.items():

@@ -32,8 +32,9 @@ const captionOf = (text) => element("caption", {}, element("span", {}, text));
 /** A name of parts that may stand on two lines: it breaks behind punctuation, never within a word or number. */
 const breakable = (text) => text.split(/(?<=[[\](),=:_/]|\.(?!\d))/).flatMap((piece, i) => i ? [element("wbr"), piece] : [piece]);
 
-/** A text as a sentence. */
-const sentence = (text) => text && text[0].toUpperCase() + text.slice(1) + (/[.!?]$/.test(text) ? "" : ".");
+/** A text with a capital at its beginning, and one as a sentence. */
+const sentenceCase = (text) => text && text[0].toUpperCase() + text.slice(1);
+const sentence = (text) => text && sentenceCase(text) + (/[.!?]$/.test(text) ? "" : ".");
 
 const isNumber = (value) => typeof value === "number" && Number.isFinite(value);
 

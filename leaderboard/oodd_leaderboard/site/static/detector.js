@@ -102,8 +102,10 @@ function heat(board, row, chosen) {
   };
   const groups = [...Object.keys(GROUP_TITLES), ""].filter((g) => inGroup(board, g).length);
   const ordered = groups.flatMap((g) => inGroup(board, g));
+  const caption = captionOf(`${rankingTitle(board)} (%): teal is better than chance, orange is worse`);
+  if (ownKinds(board)) return scroller(element("table", { class: "heat" }, caption, ...linesOfKinds(board, groups, one, total)));
   return scroller(element("table", { class: "heat" },
-    captionOf(`${rankingTitle(board)} (%): teal is better than chance, orange is worse`),
+    caption,
     element("thead", {},
       groups.some(Boolean) && element("tr", {}, element("td", {}), groups.map((g) =>
         element(g ? "th" : "td", { scope: g && "colgroup", colspan: inGroup(board, g).length }, GROUP_TITLES[g])), element("td", {})),
@@ -115,6 +117,31 @@ function heat(board, row, chosen) {
         ordered.map((a) => one(environment, a)), total({ environment }))),
       element("tr", { class: "total" }, element("th", { scope: "row" }, "Mean"),
         ordered.map((a) => total({ anomaly: a })), total({})))));
+}
+
+/** Whether most anomalies are of few environments, as those that a season draws for each. */
+const ownKinds = (board) => board.cells.length < 0.6 * Object.keys(board.environments).length * Object.keys(board.anomalies).length;
+
+/** Head and body of such a board's cells: an environment's own stand side by side, each with its name and strength. */
+function linesOfKinds(board, groups, one, total) {
+  const environments = Object.entries(board.environments);
+  const kinds = (environment, group) => inGroup(board, group).filter((a) => board.cells.some(([e, kind]) => e === environment && kind === a));
+  const widths = groups.map((g) => Math.max(...environments.map(([e]) => kinds(e, g).length)));
+  const cell = (environment, anomaly) => {
+    const node = one(environment, anomaly);
+    const strength = board.strengths[`${environment}|${anomaly}`];
+    (node.querySelector("a") ?? node).prepend(element("span", { class: "kind" }, anomalyOf(board, anomaly).title, strength && element("span", {}, strength)));
+    return node;
+  };
+  const wide = (node, i) => Object.assign(node, { colSpan: widths[i] });
+  return [
+    element("thead", {}, element("tr", {}, element("th", { scope: "col", class: "left" }, "Environment"),
+      groups.map((g, i) => wide(element("th", { scope: "colgroup" }, GROUP_TITLES[g] ?? ""), i)), element("th", { scope: "col" }, "Mean"))),
+    element("tbody", {}, environments.map(([environment, title]) => element("tr", {}, element("th", { scope: "row" }, title),
+      groups.map((g, i) => [...kinds(environment, g).map((a) => cell(environment, a)),
+        ...Array.from({ length: widths[i] - kinds(environment, g).length }, () => element("td", {}))]), total({ environment }))),
+    element("tr", { class: "total" }, element("th", { scope: "row" }, "Mean"), groups.map((g, i) => wide(total({ anomaly: `*${g}` }), i)), total({}))),
+  ];
 }
 
 /** Numbers and drawings of one cell. */
@@ -214,16 +241,16 @@ function metricsTable(board, row) {
 /** What is known of where a row is from. Only http addresses become links. */
 function facts(board, row) {
   const text = (value) => typeof value === "string" ? value : JSON.stringify(value);
-  const { entry, version, parameters, command } = PARTS.get(row.part);
+  const { entry, version, parameters, day, command } = PARTS.get(row.part);
   const wheels = board.season?.installed[row.detector] ?? [];
   const bibtex = bibtexOf(row);
   return element("dl", { class: "facts" }, [
-    ["Plug-in", `${row.plugin} ${version}`],
+    ["Plug-in", `${row.plugin} ${version}`], ["Run on", day],
     ["Parameters", Object.entries(parameters).map(([name, value]) => `${name} = ${text(value)}`).join(", ")],
     ["Seeds", row.seeds.join(", ")],
     ["Installed", entry.requirement], ["SHA-256", entry.sha256],
     ["With", wheels.map(({ distribution, version: of, sha256 }) => element("div", {}, `${distribution} ${of}, SHA-256 ${sha256.slice(0, 12)}`))],
-    ["Reported in", entry.reported], ["Run it", command && element("code", { class: "bibtex" }, command)],
+    ["Reported in", entry.reported], ["Run it", command && [board.season?.command, command].filter(Boolean).map((line) => element("code", { class: "bibtex" }, line))],
     ["Authors", entry.authors], ["Paper", entry.paper], ["Year", entry.year && String(entry.year)], ["Licence", entry.licence],
     ["Address", linkTo(entry.url, entry.url)],
     ["Citation", bibtex && element("div", {}, element("pre", { class: "bibtex" }, bibtex),

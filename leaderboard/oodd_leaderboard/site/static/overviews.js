@@ -86,7 +86,7 @@ function heatPage(board) {
     element("form", { class: "choices", autocomplete: "off" }, tabs("heat-columns", "Columns", options, overview.columns, again),
       csvButton("heatmap", () => document.getElementById("heatmap"))),
     element("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "Heat map" },
-      element("table", { class: overview.columns === "cell" ? "heat tight" : "heat", id: "heatmap" },
+      element("table", { class: columns.length > 12 ? "heat tight" : "heat", id: "heatmap" },
         captionOf("The colour of the page is 50, chance; teal is better, orange is worse than chance"),
         element("thead", {}, element("tr", {}, element("th", { scope: "col", class: "left" }, "Detector"),
           columns.map(({ title, hint }) => element("th", { scope: "col", title: hint }, element("span", {}, title))), element("th", { scope: "col" }, "Mean"))),

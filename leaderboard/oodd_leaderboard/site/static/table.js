@@ -142,9 +142,11 @@ function headOf(board) {
     board.notice && element("p", { class: "notice" }, board.notice),
     headlineOf(board),
     element("p", { class: "lead" }, facts.join(" \u00b7 ")),
-    season && element("details", { class: "proof" }, element("summary", {}, "Bits and digest"), element("dl", { class: "facts" },
-      [["Bits", season.bits], ["Split", board.split], ["Digest", board.digest], ["Seeds", season.seeds.join(", ")], ["oodd-eval", season.oodd_eval]]
-        .map(([name, value]) => [element("dt", {}, name), element("dd", {}, value)]))),
+    season && element("details", { class: "proof" }, element("summary", {}, "Bits, digest, and what was drawn"), element("dl", { class: "facts" },
+      [["Bits", season.bits], ["Split", board.split], ["Digest", board.digest], ["Seeds", season.seeds.join(", ")], ["oodd-eval", season.oodd_eval],
+        ["The split again", element("code", { class: "bibtex" }, season.command)]].map(([name, value]) => [element("dt", {}, name), element("dd", {}, value)])),
+      scroller(tableOf({ class: "plain" }, `${season.drawn.title}. ${season.drawn.note}`, season.drawn.header.map(sentenceCase),
+        season.drawn.rows.map(([environment, ...kinds]) => lineOf(environmentOf(board, environment), kinds.map((text) => element("td", { class: "text" }, text))))))),
   ];
 }
 
