@@ -44,6 +44,8 @@ from committed import (
 from oodd_interventions.columns import ALL, COLUMNS, row_of
 from oodd_interventions.page import sections
 from oodd_leaderboard.pages import documents
+from oodd_leaderboard.published import board_table
+from oodd_leaderboard.seasons import SeasonBoard
 
 from oodd_eval.cli.main import main as oodd_eval
 from oodd_eval.data.files import read_text
@@ -300,10 +302,37 @@ TABLES: dict[str, Row] = {
 }
 
 
+SEASON = "board season"
+"""A table that is filled whole, header and rows: of the newest season so many as it has lines."""
+
+
+def newest() -> SeasonBoard | None:
+    """Return the board of the newest season; None while there is none."""
+    return next((board for board in leaderboard().seasons if not board.season.trial), None)
+
+
+def of_season(lines: int) -> str:
+    """Return the first lines of the newest season's board, the last of a row of the paper."""
+    if (board := newest()) is None or (table := board_table(board.ranks)) is None:
+        raise KeyError(f"no season has been run that the table {SEASON} could be of")
+    standings = board.ranks.standings
+    places = [i for i, row in enumerate(standings) if row.rank]
+    first, paper = places[:lines], [i for i in places if standings[i].origin == "paper"][:1]
+    if not {*paper} <= {*first}:
+        first[-1:] = paper
+    rows = [[rank, f"`{row}`", *others] for rank, row, *others in (table.rows[i] for i in first)]
+    header = [f"rank, {board.title[0].lower()}{board.title[1:]}", *table.header[1:]]
+    head = f"| {' | '.join(header)} |\n|{'---|' * len(header)}\n"
+    return head + "".join(f"| {' | '.join(cells)} |\n" for cells in rows)
+
+
 def filled(page: str) -> str:
     """Return a page with the numbers of its tables; an unknown table or row raises `KeyError`."""
 
     def table(match: re.Match[str]) -> str:
+        if match["name"] == SEASON:
+            marker = match["head"].partition("\n")[0]
+            return f"{marker}\n{of_season(len(match['rows'].splitlines()))}"
         row = TABLES[match["name"]]
         texts = []
         for line in match["rows"].splitlines():
@@ -331,7 +360,7 @@ def problems(pages: dict[Path, str]) -> Iterator[str]:
     for path, text in pages.items():
         if filled(text) != text:
             yield f"{path.relative_to(ROOT)}: tables are out of date, run docs/figures/tables.py"
-    for name in TABLES:
+    for name in [*TABLES, *([SEASON] if newest() else [])]:
         if not any(f"<!-- table: {name} -->\n|" in text for text in pages.values()):
             yield f"no page has the table {name}"
     yield from sentences.problems(pages[path] for path in PAGES)
