@@ -17,7 +17,7 @@ from oodd_leaderboard.seasons import SeasonBoard
 from oodd_leaderboard.site.content import site_data
 from oodd_leaderboard.standings import ordered
 
-from oodd_eval.data.condition import rungs_of
+from oodd_eval.data.condition import Condition, rungs_of
 from oodd_eval.metrics.auc import AlarmRule, Contribution
 from oodd_eval.metrics.catalogue import GUARANTEED, RANKING
 from oodd_eval.metrics.cusum import Standardization
@@ -138,11 +138,12 @@ def row_records(detector, *, rng, level=None, cells=CELLS, failed=(), seeds=(0,)
     return records
 
 
-def season(*, name="2026-11", date="2026-11-27", trial=False, cells=CELLS, rows=tuple(ROWS)):
+def season(*, name="2026-11", date="2026-11-27", trial=False, cells=CELLS, rows=tuple(ROWS),
+           strength=""):  # fmt: skip
     """A season of made-up rows: one fails in two cells, one is an oracle, one a stranger's."""
     rng = np.random.default_rng(0)
     failed = {"broken": cells[:2]}
-    settings = {"digest": "5e" * 32}
+    settings = {"digest": "5e" * 32, "strength": strength}
     records = [
         replace(record, split=f"season-{name}")
         for row in rows
@@ -151,7 +152,7 @@ def season(*, name="2026-11", date="2026-11-27", trial=False, cells=CELLS, rows=
     ]  # fmt: skip
     conditions: dict[str, list[str]] = {}
     for environment, anomaly in cells:
-        conditions.setdefault(environment, []).append(anomaly)
+        conditions.setdefault(environment, []).append(str(Condition(anomaly, strength)))
     about = Season(
         name=name, bits="0123456789abcdef" * 2, protocol=1, oodd_eval="0.3.0",
         split=SeasonSplit(f"season-{name}", "5e" * 32, SIZES), seeds=[0, 1, 2],

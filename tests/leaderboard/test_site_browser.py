@@ -363,6 +363,32 @@ def test_heat_shows_every_cell_of_a_row(browser, season):
             assert next(shown) == show_value(value, "auc_matched")
 
 
+KINDS = {"cartpole": ("iid", "gravity"), "hopper": ("drift", "components")}
+
+
+def test_kinds_of_single_environments_stand_side_by_side_with_their_strengths(window, tmp_path):
+    cells = [(e, a) for e, kinds in KINDS.items() for a in kinds]
+    board = helpers_site.season(cells=cells, rows=("riqn", "clock"), strength="kept90")
+    window.open(written(tmp_path, (), (), [board]))
+    window.click(".proof summary")
+    drawn = window.texts(".proof tbody td")
+    assert drawn == ["iid@kept90", "gravity@kept90", "drift@kept90", "components@kept90"]
+    open_row(window, "riqn")
+    assert window.texts(".heat thead th") == ["Environment", "Sensor", "Dynamics", "Mean"]
+    row = board.ranks.standings[0].entry
+    means = [board.ranks.board.mean(row, [e], [a], "auc_matched") for e, a in cells]
+    names = ["IID", "Gravity", "Sensor Drift", "Agent's Components"]
+    assert [text.split("\n") for text in window.texts(".heat tbody td:has(a)")] == [
+        [name, "kept90", show_value(mean, "auc_matched")]
+        for name, mean in zip(names, means, strict=True)
+    ]
+    recorded, run = window.texts("#source code")
+    assert recorded.split("--bits ")[1] == f"{board.season.bits} --output rebuilt"
+    assert run == (
+        "oodd-eval run --detector riqn --env cartpole,hopper --split rebuilt/split --seed 0,1,2"
+    )
+
+
 def test_curves_are_drawn_from_what_is_reported_and_played(browser, reported):
     source = next(s for s in reported[0].sources.values() if s.curves)
     units = read_curves(source.curves)["units"]
