@@ -13,6 +13,7 @@ from oodd_leaderboard import published, seasons
 from oodd_leaderboard.pages import CELLS, Leaderboard, cells, first_rows, page
 from oodd_leaderboard.published import PUBLISHED, published_bytes, read_published
 from oodd_leaderboard.season_files import write_row, write_season
+from oodd_leaderboard.seasons import read_season_board
 
 from oodd_eval.cli.main import main
 from oodd_eval.data.files import decompress
@@ -106,6 +107,23 @@ def test_build_writes_a_season_and_refuses_an_incomplete_one(leaderboard, season
     assert re.search(r"mine: .*hopper", said)
     assert re.search(r"rf: .*hopper", said)
     assert "riqn:" not in said
+
+
+def test_an_oracle_has_the_cells_whose_equations_it_has(tmp_path, season):
+    directory = write(tmp_path / "season", season)
+    (oracle,) = (row for row in season.ranks.standings if row.training == "oracle")
+    lacking = {"status": "incompatible", "metrics": {}, "per_trajectory": {}}
+    records = [
+        replace(r, training="oracle", **(lacking if r.environment == "hopper" else {}))
+        for r in oracle.records
+    ]
+    write_row(directory, "oracle", records)
+    board = read_season_board(directory)
+    (row,) = (row for row in board.ranks.standings if row.training == "oracle")
+    assert row.state == "4 of 8 cells missing, oracle"
+    text = page(Leaderboard([board]))
+    assert re.search(r"\| –.* oracle +\| oracle +\| +\d\d\.\d .*\\\* \|", text)  # noqa: RUF001
+    assert "incompatible" not in text
 
 
 def test_a_trial_is_built_where_it_lies_and_says_that_it_is_none(tmp_path):
