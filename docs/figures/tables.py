@@ -57,8 +57,8 @@ from oodd_eval.results.strengths import DETECTION, Strengths
 from oodd_eval.results.tables import Tables
 
 PAGES = (README, RESULTS, *DETAILS, INTERVENTIONS, FAILURES)
-FILLED_ONLY = ROOT / "docs" / "public-logs.md"
-"""A page whose tables are filled, and whose other numbers say what files hold."""
+FILLED_ONLY = ROOT / "docs" / "public-logs.md", ROOT / "docs" / "index.md"
+"""Pages whose tables are filled, and whose other numbers are of files and of a picture."""
 
 MAIN = Path(__file__).with_name("main.jsonl.xz")
 """Records of the README's main command: ``records.jsonl`` of its results."""
@@ -272,7 +272,6 @@ def verdicts(text: str) -> str:
 
 
 TABLES: dict[str, Row] = {
-    "headline": of_board("mini"),
     "board mini": of_board("mini"),
     "board standard": of_board("standard"),
     "environments": by_environment,
@@ -442,7 +441,7 @@ def unlike(fresh: str, committed: str) -> Iterator[str]:
 
 def main(arguments: list[str]) -> int:
     """Fill the pages, or with ``--check`` print what is wrong in the documents."""
-    pages = {path: path.read_text(encoding="utf-8") for path in (*PAGES, FILLED_ONLY)}
+    pages = {path: path.read_text(encoding="utf-8") for path in (*PAGES, *FILLED_ONLY)}
     if arguments == ["--check"]:
         lines = [*problems(pages)]
         print("\n".join(lines) or "numbers of the documents are those of what is committed")
