@@ -11,7 +11,6 @@ from oodd_leaderboard.standings import primary_settings
 from oodd_eval.results.board import Board, boards
 from oodd_eval.results.directory import ResultsDirectory, read_records
 from oodd_eval.results.identity import Setting
-from oodd_eval.results.record import Record
 
 ROOT = Path(__file__).parents[2]
 BOARD = ROOT / "leaderboard"
@@ -19,6 +18,8 @@ README, RESULTS = ROOT / "README.md", ROOT / "docs" / "results.md"
 DETAILS = sorted((ROOT / "docs" / "results").glob("*.md"))
 INTERVENTIONS = ROOT / "docs" / "interventions.md"
 FAILURES = ROOT / "docs" / "failures.md"
+
+SEASON = "season"
 
 Row = Callable[[str], str]
 """Return the cells of a row behind its first one, separated by bars, from what the first names."""
@@ -36,37 +37,47 @@ def leaderboard() -> Leaderboard:
     return read_leaderboard(BOARD)
 
 
-def reported(split: str) -> list[Record]:
-    """Return the records of the rows reported on a split."""
-    boards_of_rows = (section.ranks.board for section in leaderboard().reported)
-    return [r for board in boards_of_rows for r in board.records if r.split == split]
-
-
-@functools.cache
-def ranking(split: str) -> dict[str, dict[str, str]]:
-    """Return the rows reported on a split by detector, without variants."""
-    (file,) = (BOARD / "tables").glob(f"{split}-*.csv")
-    rows = lines(str(file.relative_to(BOARD)))
-    return {row["detector"]: row for row in rows if row["variant"] == "false"}
-
-
 @functools.cache
 def board(name: str) -> Board:
-    """Return a suite's board, or that of the rows reported on mini."""
-    if name == "mini":
-        records = reported(name)
-    else:
-        records = ResultsDirectory(BOARD / "suites" / name).records()
-    (of_split,) = boards(records)
-    return of_split
+    """Return a suite's board, that of the rows reported on a split, or the newest season's.
+
+    While there is no season, the rows reported on mini stand for it.
+    """
+    if name == SEASON:
+        seasons = leaderboard().seasons
+        return seasons[0].ranks.board if seasons else board("mini")
+    if (BOARD / "suites" / name).is_dir():
+        (of_split,) = boards(ResultsDirectory(BOARD / "suites" / name).records())
+        return of_split
+    reported = (section.ranks.board for section in leaderboard().reported)
+    return next(board for board in reported if board.split == name)
+
+
+@functools.cache
+def logs() -> dict[str, Board]:
+    """Return the boards of public logs by environment."""
+    of_splits = boards(ResultsDirectory(BOARD / "suites" / "logs").records())
+    return {board.environments[0]: board for board in of_splits}
 
 
 def primary(records: Board, name: str) -> Setting:
-    """Return the row of a board that stands for a detector."""
-    with_defaults = Setting(name)
-    if with_defaults in records.entries:
-        return with_defaults
-    return next(s for s in primary_settings(records.records) if s.detector == name)
+    """Return the row of a board that stands for a detector, or for an entry such as ``riqn-5``.
+
+    `KeyError`: it is not on the board; `NotRunError`, where an entry has this name.
+    """
+    entries = {entry.name: entry for entry in leaderboard().entries}
+    variant = entries[name] if name in entries and entries[name].variant else None
+    setting = Setting.of(variant.detector, 1, variant.parameters) if variant else Setting(name)
+    simplest = {row.detector: row for row in primary_settings(records.records)}
+    if setting not in records.entries and name in simplest:
+        return simplest[name]
+    if setting not in records.entries:
+        raise (NotRunError if name in entries else KeyError)(name)
+    return setting
+
+
+class NotRunError(KeyError):
+    """An entry that has no row on a board, or an environment that a board does not have."""
 
 
 def mean(
@@ -81,6 +92,8 @@ def mean(
     records = board(name)
     setting = row if isinstance(row, Setting) else primary(records, row)
     over = [*environments] or records.environments, [*anomalies] or records.anomalies
+    if absent := {*over[0]} - {*records.environments}:
+        raise NotRunError(*absent)
     return 100 * records.mean(setting, *over, metric).value
 
 

@@ -7,9 +7,10 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any, Final
 
 import numpy as np
-from committed import board, claims, mean, of_reproductions, overview, ranking, rollouts
+from committed import SEASON, board, claims, mean, of_reproductions, overview, primary, rollouts
 
 from oodd_eval.data.facts import ENVIRONMENTS
+from oodd_eval.results.board import Column
 from oodd_eval.results.identity import Setting
 
 ROBOTS: Final = [name for name, info in ENVIRONMENTS.items() if not info.discrete]
@@ -105,12 +106,6 @@ def gains(
         yield f"{sign * (other - one):.1f}"
 
 
-def from_mini(metric: str, *names: str) -> list[str]:
-    """Return a metric on `standard` and on `mini`, row by row, in per cent."""
-    return [f"{100 * float(ranking(split)[n][metric]):.1f}"
-            for n in names for split in ("standard", "mini")]  # fmt: skip
-
-
 def in_worlds(
     name: str, metric: str = "found_within_100_at_5pct"
 ) -> dict[tuple[str, str, str], float]:
@@ -166,8 +161,7 @@ def beyond_ladder(one: str, other: str) -> list[str]:
     return [below, pairs, above, overview("ladder-noisy-1", other)[4]]
 
 
-RECENT = ("rpt-a", "logpzo-a", "wm-kl-a")
-"""Networks of recent papers that see actions."""
+RIVALS = ("logpzo", "rpt-a", "wm-kl-a", "deedee", "paano", "knn", "pca", "rnd")
 STEPS = ("rf", "riqn-r", "riqn-ms", "npn")
 ENDS = ("value", "low", "high")
 EASIER = "sensor-above-dynamics-models"
@@ -222,9 +216,6 @@ SENTENCES: list[tuple[str, Callable[[], Iterable[Any]]]] = [
      lambda: points("delay-grows-10", factor=1, digits=0)),
     ("RIQN by {} points", lambda: points("riqn-above-riqn-ms-10", factor=-100)),
     ("N-RIQN by {} points; at Δ = 1", lambda: points("memory-10-7")),
-    (("`rpt-a` finds {} % after {} % on `mini`, `logpzo-a` {} % after {} % and `wm-kl-a` {} % "
-      "after {} %."),
-     lambda: from_mini("found_within_20_at_5pct", *RECENT)),
     ("{} of {} cells are `loss1` and `loss5`.", lambda: hidden("oracle")[:2]),
     (("episodes are found by `oracle` in {} of them, by `panel-a` in {}, by `mewma-a` in {} and by "
       "`pe-a` in {}."),
@@ -253,6 +244,53 @@ SENTENCES: list[tuple[str, Callable[[], Iterable[Any]]]] = [
 """Phrases of the page with the numbers that they have to have."""
 
 
+# Orders: a phrase of the page, and whether the results are so
+
+
+def above(first: str, others: str, metric: str = "auc_matched", split: str = SEASON) -> bool:
+    """Tell whether every row of some has more of a metric than every row of others."""
+    ours, theirs = ([mean(split, row, metric) for row in names.split(",")]
+                    for names in (first, others))  # fmt: skip
+    return min(ours) > max(theirs)
+
+
+def leads() -> bool:
+    """Tell whether no ranked row but those of ensemble and panel is above these."""
+    ours = ("panel-a", "pe-a")
+    names = {row.detector for row in board(SEASON).entries} - {*ours, "oracle", "oracle-gym"}
+    return all(above(",".join(ours), name) for name in names)
+
+
+def promise_holds(split: str) -> bool:
+    """Tell whether no row's false episodes are above the promised 5 % by all of its interval."""
+    rows, column = board(split), Column("false_episodes_at_5pct", intervals=True)
+    names = {row.detector for row in rows.entries}
+    return all(rows.of(primary(rows, name), column).low <= 0.05 for name in names)
+
+
+ORDERS: list[tuple[str, Callable[[], bool]]] = [
+    ("asks it beside simpler members, are above all others.", leads),
+    ("it is above every network of the paper.",
+     lambda: above("mewma-a", "riqn-5,riqn,riqn-ms,n-riqn,npn")),
+    ("the forest `rf` with one moving average, is above `rf`.", lambda: above("rf-ewma", "rf")),
+    ("`pe-a` is above `pe`, `panel-a` above `panel` and `logpzo-a` above `logpzo`.",
+     lambda: all(above(f"{name}-a", name) for name in ("pe", "panel", "logpzo"))),
+    ("and finds more within 20 steps than `riqn-5`.",
+     lambda: above("range", "riqn-5", "found_within_20_at_5pct")),
+    ("has a higher matched AUC than `riqn-5`.", lambda: above("knn", "riqn-5")),
+    ("LunarLander is the hardest of the seven",
+     lambda: all(
+         mean(SEASON, row, "auc_matched", environments=["lunarlander"])
+         <= min(mean(SEASON, row, "auc_matched", environments=[e]) for e in ENVIRONMENTS)
+         for row in ("panel-a", "pe-a"))),
+    ("(../leaderboard/README.md#reported-on-standard-protocol-3), and holds there.",
+     lambda: promise_holds("standard")),
+    ("None comes within five points of `pe-a`.",
+     lambda: all(float(apart("mini", "pe-a", row)) > 5 for row in RIVALS)),
+]  # fmt: skip
+"""Phrases of the page on orders of rows, and whether the results are so."""
+
+
 NUMBER = re.compile(
     r"(?<![\w.,/-])[-\N{MINUS SIGN}+~]?(?:\d+(?:\.\d+)?|\.\d+)(?![\w]|[.,/-]\d|-[a-z])"
 )
@@ -270,7 +308,7 @@ SETTINGS = (
 )
 """What the reader is told of the settings and by others, which no result decides."""
 
-FILLED = re.compile(r"<!-- table: [a-z0-9 -]+ -->\n((?:\|[^\n]*\n)+)")
+FILLED = re.compile(r"<!-- table: [a-z0-9 -]+ -->\n((?:\|[^\n]*\n)+)(?:\n\*Records of [^\n]*\*)?")
 
 
 def prose(section: str) -> str:
@@ -285,6 +323,21 @@ def prose(section: str) -> str:
 def stated() -> list[str]:
     """Return the phrases of `SENTENCES` with their numbers."""
     return [phrase.format(*numbers()) for phrase, numbers in SENTENCES]
+
+
+def filled(page: str) -> str:
+    """Return a page whose sentences have the numbers of committed results; words stay."""
+    for phrase, numbers in SENTENCES:
+        texts = [r"\s+".join(map(re.escape, part.split(" "))) for part in phrase.split("{}")]
+        between = [*map(str, numbers()), ""]
+        page = re.sub(
+            "(" + r")-?\d[\d.]*(".join(texts) + ")",
+            lambda match, between=between: "".join(
+                text + number for text, number in zip(match.groups(), between, strict=True)
+            ),
+            page,
+        )
+    return page
 
 
 def unsourced(section: str) -> Iterator[str]:
@@ -316,6 +369,11 @@ def problems(texts: Iterable[str]) -> Iterator[str]:
     for phrase in stated():
         if phrase not in words:
             yield f"no page has the sentence of committed results: {phrase}"
+    for phrase, holds in ORDERS:
+        if phrase not in words:
+            yield f"no page has the phrase on an order: {phrase}"
+        elif not holds():
+            yield f"the results are not so: {phrase}"
     for section in (s for text in texts for s in re.split(r"(?m)^(?=## )", text)):
         for number in unsourced(section):
             title = section.splitlines()[0].strip("# ")

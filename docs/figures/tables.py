@@ -1,12 +1,14 @@
 """Fill the tables of README.md and pages of results from what is committed.
 
 A table below a comment such as ``<!-- table: board mini -->`` has rows whose first cell the author
-writes; this program writes the other cells. Run ``python docs/figures/tables.py`` after a change of
-committed results, or of the rows. With ``--check`` it writes nothing, and fails where a number of a
-document is not that of what is committed: in these tables, in sentences beside them
-(``sentences.py``), in the README's output, on pages of suites and on the board.
+writes; this program writes the other cells, a line on the release of the records, and the numbers
+of sentences (``sentences.py``). Run ``python docs/figures/tables.py`` after a change of committed
+results, or of the rows, and read the sentences. With ``--check`` it writes nothing, and fails where
+a number of a document is not that of what is committed, in the README's output, on pages of suites
+and on the board, too, or where a sentence states an order that the results do not have.
 """
 
+import csv
 import functools
 import io
 import json
@@ -15,7 +17,8 @@ import os
 import re
 import sys
 from collections.abc import Iterable, Iterator
-from contextlib import redirect_stdout
+from contextlib import redirect_stdout, suppress
+from dataclasses import replace
 from itertools import zip_longest
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -30,11 +33,14 @@ from committed import (
     README,
     RESULTS,
     ROOT,
+    SEASON,
+    NotRunError,
     Row,
     board,
     cells,
     claims,
     leaderboard,
+    logs,
     mean,
     of_reproductions,
     overview,
@@ -50,7 +56,7 @@ from oodd_leaderboard.seasons import SeasonBoard
 from oodd_eval.cli.main import main as oodd_eval
 from oodd_eval.data.files import read_text
 from oodd_eval.metrics.catalogue import metric_info
-from oodd_eval.results.board import Board, Column, boards
+from oodd_eval.results.board import Board, Column
 from oodd_eval.results.directory import ResultsDirectory, read_records
 from oodd_eval.results.identity import Setting
 from oodd_eval.results.strengths import DETECTION, Strengths
@@ -64,40 +70,32 @@ MAIN = Path(__file__).with_name("main.jsonl.xz")
 """Records of the README's main command: ``records.jsonl`` of its results."""
 STUDY = Path(__file__).with_name("interventions.jsonl.xz")
 """Records of the study of interventions: ``records.jsonl`` of its directory."""
-LOGS = ("skab", "alfa", "rosa", "tep", "nab", "uci", "ur3", "pi0-libero")
-"""Sets of public logs that have anomalous episodes, in the order of columns."""
+PROMISES = Path(__file__).with_name("promises.csv")
+"""What `benchmarks/promises.py` writes."""
+LOGS = ("skab", "alfa", "rosa", "tep", "nab", "uci", "ur3", "pi0-libero", "g1")
+"""Sets of public logs in the order of columns; the last has nothing to find."""
 
 HEADLINE = ("auc_matched", "found_within_20_at_5pct", "missed_at_5pct")
 
 
 @functools.cache
-def five_columns(split: str) -> dict[str, list[str]]:
-    """Return the five columns of the rows reported on a split, as text, by detector."""
-    (board,) = (s.ranks.board for s in leaderboard().reported if s.ranks.board.split == split)
-    table = Tables(board).headline()
-    texts = {name: texts for name, *texts in table.rows} if table else {}
-    detectors = {row.detector for row in board.entries}
-    return texts | {name: texts[str(primary(board, name))] for name in detectors}
+def five_columns(name: str) -> dict[str, list[str]]:
+    """Return the five columns of a board's rows as text, by row."""
+    table = Tables(board(name)).headline()
+    return {name: texts for name, *texts in table.rows} if table else {}
 
 
-def of_board(split: str) -> Row:
+def of_board(name: str) -> Row:
     """Return the five columns of a row on a board."""
-    return lambda name: " | ".join(five_columns(split)[name])
+    return lambda row: " | ".join(five_columns(name)[str(primary(board(name), row))])
 
 
 def by_environment(name: str) -> str:
-    """Return matched AUC by group, and dynamics anomalies that are missed, of an environment."""
-    sensor, dynamics = board("mini").in_group("sensor"), board("mini").in_group("dynamics")
-
-    def value(row: str, metric: str, group: Iterable[str]) -> float:
-        return mean("mini", row, metric, environments=[name], anomalies=group)
-
-    pairs = [
-        ", ".join(f"{value(row, 'auc_matched', group):.1f}" for row in ("panel", "pe-a"))
-        for group in (sensor, dynamics)
-    ]
-    missed = (value(row, "missed_at_5pct", dynamics) for row in ("mewma-a", "panel", "pe-a"))
-    return " | ".join([*pairs, *(f"{share:.0f}" for share in missed)])
+    """Return matched AUC of three rows in an environment, each with the share that it misses."""
+    metrics = ("auc_matched", "missed_at_5pct")
+    pairs = [[mean(SEASON, row, metric, environments=[name]) for metric in metrics]
+             for row in ("panel-a", "pe-a", "mewma-a")]  # fmt: skip
+    return " | ".join(f"{auc:.1f}, {missed:.0f}" for auc, missed in pairs)
 
 
 def at_horizons(name: str) -> str:
@@ -173,26 +171,40 @@ def in_worlds(name: str) -> str:
     return " | ".join([aucs, *thresholds("worlds", name)[1:], false])
 
 
-@functools.cache
-def logs() -> dict[str, Board]:
-    """Return the boards of public logs by environment."""
-    of_splits = boards(ResultsDirectory(BOARD / "suites" / "logs").records())
-    return {board.environments[0]: board for board in of_splits}
+def on_logs(name: str) -> str:
+    """Return by set of logs the metric by which rows rank, and nominal episodes with an alarm.
 
-
-def on_logs(metric: str = "", sets: Iterable[str] = LOGS) -> Row:
-    """Return a detector's means over sets of logs of a metric, by default that by which they rank.
-
-    A dash stands where the detector was not run.
+    A dash stands where the row was not run, or there is nothing to find.
     """
 
-    def value(board: Board, entry: Setting) -> str:
-        if entry not in board.entries:
+    def pair(of: Board) -> str:
+        setting = Setting(name)
+        if setting not in of.entries:
             return "–"  # noqa: RUF001  an en dash
-        over = board.environments, board.anomalies
-        return f"{100 * board.mean(entry, *over, metric or board.ranking).value:.1f}"
+        over = of.environments, of.anomalies
+        metrics = of.ranking, "false_episodes_at_10pct"
+        auc, false = (100 * of.mean(setting, *over, metric).value for metric in metrics)
+        return f"{'–' if math.isnan(auc) else f'{auc:.1f}'}, {false:.0f}"  # noqa: RUF001
 
-    return lambda name: " | ".join(value(logs()[of], Setting(name)) for of in sets)
+    if not any(Setting(name) in of.entries for of in logs().values()):
+        primary(logs()[LOGS[0]], name)
+    return " | ".join(pair(logs()[name]) for name in LOGS)
+
+
+def promise(place: str) -> dict[str, str]:
+    """Return a line of `PROMISES`, named as ``skab, panel``."""
+    lines = csv.DictReader(PROMISES.read_text(encoding="utf-8").splitlines())
+    (line,) = (line for line in lines if f"{line['set']}, {line['row']}" == place)
+    return line
+
+
+def promised(place: str) -> str:
+    """Return the shares of a row's nominal test episodes with an alarm."""
+    line = promise(place)
+    shares = [line[column].replace("-", "–") or "–"  # noqa: RUF001  an en dash
+              for column in ("as it is", "baseline", "rolling", "both")]  # fmt: skip
+    shuffled = f"{line['shuffled']} ({line['errors']})" if line["shuffled"] else "–"  # noqa: RUF001
+    return " | ".join([*shares, shuffled, f"{line['run']} of {line['episodes']}"])
 
 
 @functools.cache
@@ -273,7 +285,7 @@ def verdicts(text: str) -> str:
 
 TABLES: dict[str, Row] = {
     "board mini": of_board("mini"),
-    "board standard": of_board("standard"),
+    "season": of_board(SEASON),
     "environments": by_environment,
     "horizons": at_horizons,
     "noise": under_noise,
@@ -285,8 +297,8 @@ TABLES: dict[str, Row] = {
     "ladder oracles": by_rung,
     "worlds": in_worlds,
     "claims": verdicts,
-    "logs": on_logs(),
-    "logs false": on_logs("false_episodes_at_10pct", [*LOGS, "g1"]),
+    "logs": on_logs,
+    "promises": promised,
     "mask": of_study("Return saved by mask"),
     "mask costs": of_study("What mask prevents"),
     "stop": of_study("Return saved by stop"),
@@ -299,9 +311,83 @@ TABLES: dict[str, Row] = {
     "outcomes unseen": unseen_tasks,
     "worth": worth,
 }
+BOARDS: dict[str, tuple[Iterable[str], tuple[str, ...]]] = {
+    "board mini": (["mini"], ()),
+    "season": ([SEASON], ()),
+    "environments": ([SEASON], ("panel-a", "pe-a", "mewma-a")),
+    "horizons": (["horizons"], ()),
+    "noise": (NOISE, ()),
+    "noise kinds": (NOISE, ("pe-a", "mewma-a")),
+    "oracles": (NOISE, ("oracle-gym", "pe-a")),
+    "ladder": ([LADDER], ()),
+    "ladder oracles": ([LADDER], ()),
+    "worlds": (["worlds"], ()),
+    "logs": (LOGS, ()),
+    "outcomes within": (["pi0-failures"], ()),
+    "outcomes alarms": (["pi0-failures"], ()),
+    "outcomes unseen": (["pi0-unseen"], ()),
+    "worth": (["mini"], ()),
+}
+"""The boards of a table, and its rows, where its lines do not begin or end with these."""
+REPRODUCED = {
+    "claims": ["mini"],
+    "losses mini-paper": ["mini", "mini-paper"],
+    "losses reduced-paper": ["standard", "reduced-paper"],
+}
+"""Tables of reproductions, which begin with their release."""
 
 
-SEASON = "board season"
+def named(label: str) -> str:
+    """Return the name of a line by its first cell; behind it may stand a description."""
+    name = re.match(r"`([A-Za-z0-9:._-]+)`", label)
+    return name[1] if name else label
+
+
+def releases(table: str, label: str) -> set[str]:
+    """Return the releases of the records that a line of a table is of."""
+    if table == "promises":
+        return {promise(label)["release"]}
+    if table in REPRODUCED:
+        pages = [read_text(BOARD / "reproduction" / of / "README.md") for of in REPRODUCED[table]]
+        return {re.search(r"oodd-eval ([\d.]+)", page)[1] for page in pages}
+    names, rows = BOARDS[table]
+    found = set()
+    for of in (logs().get(name) or rollouts().get(name) or board(name) for name in names):
+        for row in rows or (named(label).rpartition(", ")[2],):
+            with suppress(KeyError):
+                setting = primary(of, row)
+                row_of = replace(setting, horizon=1)
+                same = (r for r in of.records if replace(r.setting, horizon=1) == row_of)
+                found |= {r.provenance["oodd_eval"] for r in same}
+    return found
+
+
+def caption(table: str, by_line: list[set[str]]) -> tuple[str, str]:
+    """Return the line below a table, of the release of its records, and the newest release.
+
+    Lines with records of others are marked.
+    """
+    found = sorted({r for line in by_line for r in line}, key=lambda r: [*map(int, r.split("."))])
+    text = f"Records of release {found[-1]}"
+    if len(found) > 1:
+        text += f"; lines marked † have some of {' and '.join(found[:-1])}"
+    if SEASON in BOARDS.get(table, ((), ()))[0]:
+        seasons = leaderboard().seasons
+        text += (
+            f", {seasons[0].title.lower()}" if seasons else ", reported on `mini`: no season yet"
+        )
+    return f"\n*{text}.*\n", found[-1]
+
+
+def cells_of(table: str, label: str) -> str:
+    """Return the cells behind the first; dashes where the line's row or environment was not run."""
+    try:
+        return TABLES[table](named(label))
+    except NotRunError:
+        return "–"  # noqa: RUF001  an en dash
+
+
+SEASON_TABLE = "board season"
 """A table that is filled whole, header and rows: of the newest season so many as it has lines."""
 
 
@@ -313,7 +399,7 @@ def newest() -> SeasonBoard | None:
 def of_season(lines: int) -> str:
     """Return the first lines of the newest season's board, the last of a row of the paper."""
     if (board := newest()) is None or (table := board_table(board.ranks)) is None:
-        raise KeyError(f"no season has been run that the table {SEASON} could be of")
+        raise KeyError(f"no season has been run that the table {SEASON_TABLE} could be of")
     standings = board.ranks.standings
     places = [i for i, row in enumerate(standings) if row.rank]
     first, paper = places[:lines], [i for i in places if standings[i].origin == "paper"][:1]
@@ -329,23 +415,30 @@ def filled(page: str) -> str:
     """Return a page with the numbers of its tables; an unknown table or row raises `KeyError`."""
 
     def table(match: re.Match[str]) -> str:
-        if match["name"] == SEASON:
+        if match["name"] == SEASON_TABLE:
             marker = match["head"].partition("\n")[0]
             return f"{marker}\n{of_season(len(match['rows'].splitlines()))}"
-        row = TABLES[match["name"]]
-        texts = []
-        for line in match["rows"].splitlines():
-            label = line.split("|")[1].strip()
-            # Behind the name may stand a description.
-            named = re.match(r"`([A-Za-z0-9:._-]+)`", label)
-            texts.append(f"| {label} | {row(named[1] if named else label)} |\n")
-        return match["head"] + "".join(texts)
+        name, lines = match["name"], match["rows"].splitlines()
+        labels = [line.split("|")[1].strip().removesuffix(" †") for line in lines]
+        by_line = (
+            [releases(name, label) for label in labels]
+            if name in {*BOARDS, *REPRODUCED, "promises"}
+            else []
+        )
+        below, release = caption(name, by_line) if any(by_line) else ("", "")
+        marks = [" †" if line - {release} else "" for line in by_line] or [""] * len(labels)
+        width = match["head"].splitlines()[1].count("|") - 2
+        texts = (cells_of(name, label) for label in labels)
+        texts = [" | ".join(["–"] * width) if text == "–" else text for text in texts]  # noqa: RUF001
+        rows = zip(labels, marks, texts, strict=True)
+        return match["head"] + "".join(f"| {a}{b} | {c} |\n" for a, b, c in rows) + below
 
-    pattern = (
+    return re.sub(
         r"(?P<head><!-- table: (?P<name>[a-z0-9 -]+) -->\n\|[^\n]*\n\|[-|]+\|\n)"
-        r"(?P<rows>(?:\|[^\n]*\n)+)"
+        r"(?P<rows>(?:\|[^\n]*\n)+)(?:\n\*Records of [^\n]*\*\n)?",
+        table,
+        page,
     )
-    return re.sub(pattern, table, page)
 
 
 def problems(pages: dict[Path, str]) -> Iterator[str]:
@@ -359,7 +452,7 @@ def problems(pages: dict[Path, str]) -> Iterator[str]:
     for path, text in pages.items():
         if filled(text) != text:
             yield f"{path.relative_to(ROOT)}: tables are out of date, run docs/figures/tables.py"
-    for name in [*TABLES, *([SEASON] if newest() else [])]:
+    for name in [*TABLES, *([SEASON_TABLE] if newest() else [])]:
         if not any(f"<!-- table: {name} -->\n|" in text for text in pages.values()):
             yield f"no page has the table {name}"
     yield from sentences.problems(pages[path] for path in PAGES)
@@ -447,7 +540,7 @@ def main(arguments: list[str]) -> int:
         print("\n".join(lines) or "numbers of the documents are those of what is committed")
         return int(bool(lines))
     for path, text in pages.items():
-        if (after := filled(text)) != text:
+        if (after := sentences.filled(filled(text))) != text:
             path.write_text(after, encoding="utf-8")
             print("changed:", path.relative_to(ROOT))
     return 0

@@ -15,12 +15,13 @@ import tables
 
 def test_a_wrong_number_in_a_table_is_put_right():
     page = (ROOT / "docs" / "results" / "ladder.md").read_text(encoding="utf-8")
-    ladder = re.search(r"<!-- table: ladder -->\n(\|.*\n)+", page)[0]
+    ladder = re.search(r"<!-- table: ladder -->\n(\|.*\n)+\n\*.*\n", page)[0]
     assert tables.filled(ladder.replace(".", ".9")) == ladder
 
 
 def test_a_table_of_the_season_has_its_first_rows_and_the_first_of_the_paper(monkeypatch, season):
-    page = f"<!-- table: {tables.SEASON} -->\n| a | b |\n|---|---|\n| x | y |\n| x | y |\n\nText\n"
+    lines = "| a | b |\n|---|---|\n| x | y |\n| x | y |\n\nText\n"
+    page = f"<!-- table: {tables.SEASON_TABLE} -->\n{lines}"
     monkeypatch.setattr(tables, "leaderboard", Leaderboard)
     with pytest.raises(KeyError, match="no season"):
         tables.filled(page)
@@ -42,6 +43,7 @@ def test_a_table_of_the_season_has_its_first_rows_and_the_first_of_the_paper(mon
 @pytest.fixture
 def one_sentence(monkeypatch):
     monkeypatch.setattr(sentences, "stated", lambda: ["It is 3 points above `knn`."])
+    monkeypatch.setattr(sentences, "ORDERS", [])
 
 
 @pytest.mark.usefixtures("one_sentence")
@@ -55,6 +57,36 @@ def test_a_sentence_with_another_number_and_a_number_without_a_source_are_seen()
     (number,) = sentences.problems([page.replace("It has 96.3", "It has 96.4")])
     assert number.startswith("Of rows: ")
     assert "It has 96.4 %" in number
+
+
+def test_numbers_of_a_sentence_are_put_right_and_its_words_stay(monkeypatch):
+    phrases = [("by {} [{}, {}] points, in {}.", lambda: ["1.5", "-0.3", "2.0", 4])]
+    monkeypatch.setattr(sentences, "SENTENCES", phrases)
+    page = "It is above\nby 7.25 [1.0,\n  3.0] points, in 12. It has 12.\n"
+    after = "It is above\nby 1.5 [-0.3,\n  2.0] points, in 4. It has 12.\n"
+    assert sentences.filled(page) == after
+
+
+def test_an_order_that_the_results_do_not_have_is_seen(monkeypatch):
+    monkeypatch.setattr(sentences, "stated", list)
+    monkeypatch.setattr(sentences, "ORDERS", [("`a` is above `b`.", lambda: False)])
+    (problem,) = sentences.problems(["`a` is\nabove `b`."])
+    assert problem.startswith("the results are not so: `a`")
+    (problem,) = sentences.problems(["`b` is above `a`."])
+    assert problem.startswith("no page has the phrase")
+
+
+def test_lines_with_records_of_an_earlier_release_are_marked(monkeypatch):
+    of_line = {"`a`": {"0.2.0", "0.3.0"}, "`b`, new": {"0.3.0"}}
+    monkeypatch.setattr(tables, "releases", lambda _, label: of_line[label])
+    monkeypatch.setitem(tables.TABLES, "worlds", lambda name: f"of {name}")
+    page = (
+        "<!-- table: worlds -->\n| row | x |\n|---|---|\n| `a` | 1 |\n| `b`, new | 2 |\n\nText.\n"
+    )
+    after = tables.filled(page)
+    assert "| `a` † | of a |\n| `b`, new | of b |\n\n*Records of release 0.3.0; " in after
+    assert after.endswith("marked † have some of 0.2.0.*\n\nText.\n")
+    assert tables.filled(after) == after
 
 
 def test_another_output_of_the_readmes_command_is_seen(monkeypatch):
