@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from oodd_leaderboard.pages import Leaderboard, read_leaderboard
+from oodd_leaderboard.seasons import SeasonBoard
 from oodd_leaderboard.standings import primary_settings
 
 from oodd_eval.results.board import Board, boards
@@ -37,6 +38,11 @@ def leaderboard() -> Leaderboard:
     return read_leaderboard(BOARD)
 
 
+def newest() -> SeasonBoard | None:
+    """Return the board of the newest season; None while there is none."""
+    return next((board for board in leaderboard().seasons if not board.season.trial), None)
+
+
 @functools.cache
 def board(name: str) -> Board:
     """Return a suite's board, that of the rows reported on a split, or the newest season's.
@@ -44,8 +50,8 @@ def board(name: str) -> Board:
     While there is no season, the rows reported on mini stand for it.
     """
     if name == SEASON:
-        seasons = leaderboard().seasons
-        return seasons[0].ranks.board if seasons else board("mini")
+        season = newest()
+        return season.ranks.board if season else board("mini")
     if (BOARD / "suites" / name).is_dir():
         (of_split,) = boards(ResultsDirectory(BOARD / "suites" / name).records())
         return of_split

@@ -9,6 +9,7 @@ from helpers_docs import ROOT
 from oodd_leaderboard.pages import Leaderboard
 
 sys.path.insert(0, str(ROOT / "docs" / "figures"))
+import committed
 import sentences
 import tables
 
@@ -22,17 +23,17 @@ def test_a_wrong_number_in_a_table_is_put_right():
 def test_a_table_of_the_season_has_its_first_rows_and_the_first_of_the_paper(monkeypatch, season):
     lines = "| a | b |\n|---|---|\n| x | y |\n| x | y |\n\nText\n"
     page = f"<!-- table: {tables.SEASON_TABLE} -->\n{lines}"
-    monkeypatch.setattr(tables, "leaderboard", Leaderboard)
+    monkeypatch.setattr(committed, "leaderboard", Leaderboard)
     with pytest.raises(KeyError, match="no season"):
         tables.filled(page)
     trial = helpers_site.season(trial=True, date="2027-01-01")
     last = helpers_site.season(rows=("mine", "rf", "clock"), date="2026-05-01")
-    monkeypatch.setattr(tables, "leaderboard", lambda: Leaderboard([last, season, trial]))
+    monkeypatch.setattr(committed, "leaderboard", lambda: Leaderboard([last, season, trial]))
     _, head, _, *rows, _, text = tables.filled(page).splitlines()
     assert head.startswith("| rank, season 2026-11 | row | whose | matched AUC |")
     assert [row.split(" | ")[1:3] for row in rows] == [["`rf`", "ours"], ["`mine`", "others, 2026"]]
     assert text == "Text"
-    monkeypatch.setattr(tables, "leaderboard", lambda: Leaderboard([season, last]))
+    monkeypatch.setattr(committed, "leaderboard", lambda: Leaderboard([season, last]))
     filled = tables.filled(page)
     *_, first, second, _, _ = filled.splitlines()
     assert first.startswith("| 1 | `riqn` | the paper, 2021 | ")
