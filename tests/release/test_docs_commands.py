@@ -52,7 +52,11 @@ KNOWN = {
             "oodd-eval run --detector persistence,random --env cartpole",
             "oodd-eval leaderboard submit oodd-results --detector persistence",
         ],
-        "rules": {r"leaderboard show$": "leaderboard show --split mini"},
+        "rules": {
+            r"leaderboard show$": "leaderboard show --split mini",
+            r"--detector mine": "--detector persistence",
+            r"--split rebuilt/split": "--split mini",  # no season is recorded for a test
+        },
     },
     "docs/how-to/release.md": {
         "before": [PERSISTENCE, "oodd-eval leaderboard submit oodd-results --detector persistence"]
