@@ -43,7 +43,7 @@ from oodd_leaderboard.reported import (
     suite_sections,
 )
 from oodd_leaderboard.season_files import SEASON
-from oodd_leaderboard.seasons import SeasonBoard, read_season_board, read_seasons
+from oodd_leaderboard.seasons import SeasonBoard, read_season_board, read_seasons, under_way
 from oodd_leaderboard.standings import OrderedBoard
 
 PAGE: Final = "README.md"
@@ -63,6 +63,7 @@ class Leaderboard:
     reported: Sequence[LeaderboardSection] = ()
     suites: Sequence[SuiteSection] = ()
     entries: Sequence[Entry] = ()
+    under_way: Sequence[str] = ()
     alone: bool = False  # a season's directory has no published file
 
     @property
@@ -80,7 +81,8 @@ def read_leaderboard(directory: Path) -> Leaderboard:
         return Leaderboard([read_season_board(directory)], alone=True)
     entries = entries_of(directory)
     reported = sections(read_reported(directory), by_detector(entries))
-    return Leaderboard(read_seasons(directory), reported, suite_sections(directory), entries)
+    suites, unfinished = suite_sections(directory), under_way(directory)
+    return Leaderboard(read_seasons(directory), reported, suites, entries, unfinished)
 
 
 def build(
@@ -190,6 +192,7 @@ def page(leaderboard: Leaderboard, project: str = "../") -> str:
     parts = [TEXTS["introduction"].format(site=f"{SITE}/{site.PAGE}")]
     if not leaderboard.seasons:
         parts.append(TEXTS["no-season"])
+    parts += [f"{escape(sentence)}\n" for sentence in leaderboard.under_way]
     parts += map(_season, leaderboard.seasons)
     if leaderboard.reported:
         parts.append(TEXTS["reported"].format(sentence=REPORTED))

@@ -7,8 +7,9 @@ from typing import Final
 
 from oodd_eval.data.facts import ENVIRONMENTS, WORLDS
 from oodd_eval.errors import ResultsError
+from oodd_eval.names import counted
 from oodd_eval.prose import Table
-from oodd_leaderboard.season_files import SEASON, Season, read_season
+from oodd_leaderboard.season_files import SEASON, Season, read_season, row_path
 from oodd_leaderboard.standings import OrderedBoard, ordered
 
 SEASONS: Final = "seasons"  # directory of the seasons in that of the leaderboard
@@ -81,9 +82,26 @@ def lacking(season: Season) -> list[str]:
 
 
 def read_seasons(leaderboard: Path) -> list[SeasonBoard]:
-    """Read the seasons of a leaderboard's directory, in the order of `newest_first`."""
-    paths = [path.parent for path in (leaderboard / SEASONS).glob(f"*/{SEASON}")]
-    return newest_first(map(read_season_board, paths))
+    """Read the seasons of a leaderboard's directory that ended, in the order of `newest_first`."""
+    return newest_first(
+        read_season_board(path) for path, season in _seasons(leaderboard) if season.date
+    )
+
+
+def under_way(leaderboard: Path) -> list[str]:
+    """Return a sentence for each season of a leaderboard's directory that has not ended."""
+    sentences = []
+    for path, season in _seasons(leaderboard):
+        if not season.date:
+            run = sum(row_path(path, name).is_file() for name in season.entries)
+            rows = counted(len(season.entries), "row(s)")
+            sentences.append(f"Season {season.name} is under way: {run} of {rows} have been run.")
+    return sentences
+
+
+def _seasons(leaderboard: Path) -> list[tuple[Path, Season]]:
+    paths = sorted(path.parent for path in (leaderboard / SEASONS).glob(f"*/{SEASON}"))
+    return [(path, read_season(path)) for path in paths]
 
 
 def newest_first(seasons: Iterable[SeasonBoard]) -> list[SeasonBoard]:

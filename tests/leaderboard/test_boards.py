@@ -109,6 +109,19 @@ def test_build_writes_a_season_and_refuses_an_incomplete_one(leaderboard, season
     assert "riqn:" not in said
 
 
+def test_a_season_that_has_not_ended_is_no_board_yet(leaderboard, season):
+    begun = leaderboard / "seasons" / "2026-12"
+    write(begun, season, without=("rf",))
+    write_season(replace(season.season, name="2026-12", date=""), begun)
+    (begun / "rows" / "mine.jsonl.xz").unlink()
+    assert main(["leaderboard", "build", str(leaderboard), "-q"]) == 0
+    text = (leaderboard / "README.md").read_text()
+    total = len(season.season.entries)
+    assert f"Season 2026-12 is under way: {total - 1} of {total} rows have been run." in text
+    assert "## Season 2026-12" not in text
+    assert "## Season 2026-11" in text
+
+
 def test_an_oracle_has_the_cells_whose_equations_it_has(tmp_path, season):
     directory = write(tmp_path / "season", season)
     (oracle,) = (row for row in season.ranks.standings if row.training == "oracle")

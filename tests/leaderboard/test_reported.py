@@ -188,7 +188,7 @@ def test_the_same_records_give_the_same_files(leaderboard, tmp_path):
     build(read, tmp_path / "two")
     assert not differences(tmp_path / "one", tmp_path / "two")
     page = (tmp_path / "one" / names[0]).read_text()
-    assert "No season has been run" in page
+    assert "No season has ended" in page
     assert "Forecasts\\_of \\*all\\*" in page
     table = next(name for name in names if name.startswith("tables/"))
     (tmp_path / "two" / table).write_text("rank\n")

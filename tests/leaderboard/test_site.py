@@ -95,7 +95,7 @@ def test_links_lead_to_the_checkout_that_a_site_is_in(tmp_path, monkeypatch):
 
 def test_the_head_says_which_season_it_is_and_of_what_day(page, reported):
     assert "<strong>Season 2026-11, 27 November 2026.</strong>" in page
-    assert "No season has been run yet" in site.files(reported)[site.PAGE]
+    assert "No season has ended yet" in site.files(reported)[site.PAGE]
     trial = helpers_site.season(name="small", trial=True)
     files = site.files((), (), [trial])
     assert "A trial season: no board." in files[site.PAGE]

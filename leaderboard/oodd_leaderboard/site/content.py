@@ -103,7 +103,7 @@ def season_line(seasons: Sequence[SeasonBoard]) -> str:
         return f"Season {boards[0].name}, {_day(boards[0].date)}."
     if seasons:
         return "A trial season: no board."
-    return "No season has been run yet: there is no board, and all rows are reported."
+    return "No season has ended yet: there is no board, and all rows are reported."
 
 
 def site_data(
