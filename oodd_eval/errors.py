@@ -67,8 +67,6 @@ class UnknownNameError(UsageError, LookupError):
         hints = [f"did you mean {close!r}?" for close in near(name, names)[:1]]
         if not hints or len(names) <= _FEW:
             hints.append(f"Known: {', '.join(names[:_LISTED]) or 'none'}{more}")
-        if kind == "detector" and "=" in name:  # from a table: riqn[members=5]
-            hints = ["parameters stand apart, as in --param DETECTOR.KEY=VALUE or parameters="]
         super().__init__(f"unknown {kind} {name!r}: {' '.join(hints)}")
         self.kind, self.name, self.known = kind, name, names
 

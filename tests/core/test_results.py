@@ -74,7 +74,6 @@ def test_detectors_come_by_name_class_instance_function_and_spec(tiny_split):
         (Size(), {"scale": 2}, r"parameters \['scale'\] for an instance of Size"),
         ([Size(), Size()], {}, r"detectors \['size', 'size'\]: expected a name for each"),
         ("rangee", {}, "unknown detector 'rangee': did you mean 'range'"),
-        ("riqn[members=5]", {}, "parameters stand apart, as in --param DETECTOR.KEY=VALUE"),
     ],
 )
 def test_what_is_no_detector_is_told(tiny_split, detector, parameters, message):
