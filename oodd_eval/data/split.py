@@ -167,9 +167,8 @@ class Split:
     def name(self) -> str:
         """The split's name; with the start of its digest when it is not the published one."""
         name = str(self.manifest["name"])
-        if name not in SPLITS or published_digests().get(name) == self.digest:
-            return name
-        return f"{name}@{self.digest[:8]}"
+        same = name not in SPLITS or published_digests().get(name) == self.digest
+        return name if same else f"{name}@{self.digest[:8]}"
 
     @property
     def digest(self) -> str:
@@ -223,8 +222,7 @@ class Split:
             In the benchmark's order; `NOMINAL` alone where there are nominal test episodes only.
         """
         groups = self.manifest["environments"][environment]["groups"]
-        tests = conditions_in(groups)
-        return tests or ((NOMINAL,) if groups[TWINS]["trajectories"] else ())
+        return conditions_in(groups) or ((NOMINAL,) if groups[TWINS]["trajectories"] else ())
 
     def strengths(self, environment: str) -> dict[Condition, float]:
         """Return the strengths of an environment's conditions as numbers, as far as it has any.
@@ -283,18 +281,20 @@ class Split:
         Raises
         ------
         UsageError
-            When one is unknown; where another split has it, that is named.
+            When one is unknown; where another split has it, built or not, that is named.
         """
         try:
             selected = select("environment", names, self.environment_names)
         except UnknownNameError as error:
-            splits = _readable_splits()
-            if holders := [n for n, split in splits if error.name in split.environment_names]:
-                raise UsageError(
-                    f"split {self.name} has no environment {error.name!r}: it is in split "
-                    f"{' and '.join(holders)}, pass --split {holders[0]}"
-                ) from None
-            raise
+            built = [n for n, split in _readable_splits() if error.name in split.environment_names]
+            defined = (n for n, d in SPLITS.items() if short_name(error.name) in d.environments)
+            if not (holders := built or [*defined]):
+                raise
+            build = "" if built else f" after `oodd-eval data build {holders[0]}`"
+            raise UsageError(
+                f"split {self.name} has no environment {error.name!r}: it is in split "
+                f"{' and '.join(holders)}, pass --split {holders[0]}{build}"
+            ) from None
         return list(dict.fromkeys(map(short_name, selected)))
 
     def select(self, environments: str, anomalies: str) -> tuple[list[str], list[str]]:
