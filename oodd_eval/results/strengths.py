@@ -122,6 +122,7 @@ class Strengths:
         return [r for r in records if r.strength and r.strength == strength_names.get(_pair(r))]
 
 
+@functools.cache
 def _calibrated(environment: str, anomaly: str) -> Mapping[str, Rung]:
     """Return the rungs of the benchmark's ladder; none for what is not calibrated."""
     # Those of other environments are known from records alone, whatever is installed.

@@ -172,12 +172,12 @@ def test_the_next_weaker_rung_stands_in_where_a_ladder_has_none(monkeypatch):
     assert Strengths.of(other).rungs == {}
     assert not StrengthTables(Board(other)).overview()
     assert Strengths.of(RECORDS + other).rungs.keys() == UNITS.keys()
-    usual = of_records.rungs_of
+    usual = of_records._calibrated
 
     def without(*place):
         return {n: r for n, r in usual(*place).items() if place[0] != "ant" or n != "kept90"}
 
-    monkeypatch.setattr(of_records, "rungs_of", without)
+    monkeypatch.setattr(of_records, "_calibrated", without)
     found = at(RECORDS, "kept90")
     assert found["ant", "iid"] == found["ant", "gravity"] == "kept99"
     assert found["hopper", "iid"] == "kept90"
