@@ -167,8 +167,8 @@ class Split:
     def name(self) -> str:
         """The split's name; with the start of its digest when it is not the published one."""
         name = str(self.manifest["name"])
-        same = name not in SPLITS or published_digests().get(name) == self.digest
-        return name if same else f"{name}@{self.digest[:8]}"
+        unambiguous = name not in SPLITS or published_digests().get(name) == self.digest
+        return name if unambiguous else f"{name}@{self.digest[:8]}"
 
     @property
     def digest(self) -> str:
@@ -287,8 +287,8 @@ class Split:
             selected = select("environment", names, self.environment_names)
         except UnknownNameError as error:
             built = [n for n, split in _readable_splits() if error.name in split.environment_names]
-            defined = (n for n, d in SPLITS.items() if short_name(error.name) in d.environments)
-            if not (holders := built or [*defined]):
+            short = {long: name for name, long in LONG_NAMES.items()}.get(error.name, error.name)
+            if not (holders := built or [n for n, s in SPLITS.items() if short in s.environments]):
                 raise
             build = "" if built else f" after `oodd-eval data build {holders[0]}`"
             raise UsageError(

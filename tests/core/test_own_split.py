@@ -119,6 +119,8 @@ def test_an_environment_of_another_split_is_told_with_that_split(place, capsys, 
     assert "'pump': it is in split mine, pass --split mine" in message
     assert main(["run", "--detector", "clock", "--env", "worlds/tank"]) == 4
     assert "--split worlds after `oodd-eval data build worlds`" in capsys.readouterr().err
+    assert main(["run", "--detector", "clock", "--env", "other/tank"]) == 4
+    assert "unknown environment 'other/tank'" in capsys.readouterr().err
     assert main(["run", "--detector", "clock", "--env", "pumpp"]) == 4
     assert "unknown environment 'pumpp'" in capsys.readouterr().err
     with pytest.raises(UsageError, match=r"unknown anomaly 'gravity'.*Known: slip"):
