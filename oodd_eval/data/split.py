@@ -292,7 +292,7 @@ class Split:
                 raise
             build = "" if built else f" after `oodd-eval data build {holders[0]}`"
             raise UsageError(
-                f"split {self.name} has no environment {error.name!r}: it is in split "
+                f"split {self.name} has no environment {error.name!r}: it is in "
                 f"{' and '.join(holders)}, pass --split {holders[0]}{build}"
             ) from None
         return list(dict.fromkeys(map(short_name, selected)))

@@ -116,7 +116,7 @@ def test_an_environment_of_another_split_is_told_with_that_split(place, capsys, 
     monkeypatch.setenv("OODD_EVAL_DATA", str(place.parent))
     assert main(["run", "--detector", "clock", "--env", "pump"]) == 4
     message = capsys.readouterr().err
-    assert "'pump': it is in split mine, pass --split mine" in message
+    assert "'pump': it is in mine, pass --split mine" in message
     assert main(["run", "--detector", "clock", "--env", "worlds/tank"]) == 4
     assert "--split worlds after `oodd-eval data build worlds`" in capsys.readouterr().err
     assert main(["run", "--detector", "clock", "--env", "other/tank"]) == 4

@@ -125,7 +125,7 @@ def test_each_is_recorded_and_evaluated_by_short_and_long_names(two, capsys):
         other = "two" if plugin == "one" else "one"
         assert main(["show", out, "--env", f"{other}/tank"]) == 4
         assert main([*run, "--env", f"{other}/tank", "--output", out]) == 4
-        assert f"it is in split of-{other}-0" in capsys.readouterr().err or plugin == "one"
+        assert f"it is in of-{other}-0 and" in capsys.readouterr().err or plugin == "one"
         assert main([*run, "--env", "worlds/tank", "--output", out]) == 4
     assert len(digests) == 2  # one each, whatever its kind was called
 
