@@ -38,20 +38,16 @@ def leaderboard() -> Leaderboard:
     return read_leaderboard(BOARD)
 
 
-def newest() -> SeasonBoard | None:
-    """Return the board of the newest season; None while there is none."""
-    return next((board for board in leaderboard().seasons if not board.season.trial), None)
+def newest() -> SeasonBoard:
+    """Return the board of the newest season."""
+    return next(board for board in leaderboard().seasons if not board.season.trial)
 
 
 @functools.cache
 def board(name: str) -> Board:
-    """Return a suite's board, that of the rows reported on a split, or the newest season's.
-
-    While there is no season, the rows reported on mini stand for it.
-    """
+    """Return a suite's board, that of the rows reported on a split, or the newest season's."""
     if name == SEASON:
-        season = newest()
-        return season.ranks.board if season else board("mini")
+        return newest().ranks.board
     if (BOARD / "suites" / name).is_dir():
         (of_split,) = boards(ResultsDirectory(BOARD / "suites" / name).records())
         return of_split

@@ -1,6 +1,6 @@
 """Fill the tables of README.md and pages of results from what is committed.
 
-A table below a comment such as ``<!-- table: board mini -->`` has rows whose first cell the author
+A table below a comment such as ``<!-- table: worlds -->`` has rows whose first cell the author
 writes; this program writes the other cells, a line on the release of the records, and the numbers
 of sentences (``sentences.py``). Run ``python docs/figures/tables.py`` after a change of committed
 results, or of the rows, and read the sentences. With ``--check`` it writes nothing, and fails where
@@ -94,7 +94,7 @@ def by_environment(name: str) -> str:
     """Return matched AUC of three rows in an environment, each with the share that it misses."""
     metrics = ("auc_matched", "missed_at_5pct")
     pairs = [[mean(SEASON, row, metric, environments=[name]) for metric in metrics]
-             for row in ("panel-a", "pe-a", "mewma-a")]  # fmt: skip
+             for row in ("panel-a", "pe-a", "arcade-a")]  # fmt: skip
     return " | ".join(f"{auc:.1f}, {missed:.0f}" for auc, missed in pairs)
 
 
@@ -284,7 +284,6 @@ def verdicts(text: str) -> str:
 
 
 TABLES: dict[str, Row] = {
-    "board mini": of_board("mini"),
     "season": of_board(SEASON),
     "environments": by_environment,
     "horizons": at_horizons,
@@ -312,9 +311,8 @@ TABLES: dict[str, Row] = {
     "worth": worth,
 }
 BOARDS: dict[str, tuple[Iterable[str], tuple[str, ...]]] = {
-    "board mini": (["mini"], ()),
     "season": ([SEASON], ()),
-    "environments": ([SEASON], ("panel-a", "pe-a", "mewma-a")),
+    "environments": ([SEASON], ("panel-a", "pe-a", "arcade-a")),
     "horizons": (["horizons"], ()),
     "noise": (NOISE, ()),
     "noise kinds": (NOISE, ("pe-a", "mewma-a")),
@@ -372,8 +370,7 @@ def caption(table: str, by_line: list[set[str]]) -> tuple[str, str]:
     if len(found) > 1:
         text += f"; lines marked † have some of {' and '.join(found[:-1])}"
     if SEASON in BOARDS.get(table, ((), ()))[0]:
-        season = newest()
-        text += f", {season.title.lower()}" if season else ", reported on `mini`: no season yet"
+        text += f", {newest().title.lower()}"
     return f"\n*{text}.*\n", found[-1]
 
 
@@ -391,8 +388,10 @@ SEASON_TABLE = "board season"
 
 def of_season(lines: int) -> str:
     """Return the first lines of the newest season's board, the last of a row of the paper."""
-    if (board := newest()) is None or (table := board_table(board.ranks)) is None:
-        raise KeyError(f"no season has been run that the table {SEASON_TABLE} could be of")
+    board = newest()
+    table = board_table(board.ranks)
+    if table is None:
+        raise ValueError(f"{board.title} has no row")
     standings = board.ranks.standings
     places = [i for i, row in enumerate(standings) if row.rank]
     first, paper = places[:lines], [i for i in places if standings[i].origin == "paper"][:1]
@@ -445,8 +444,7 @@ def problems(pages: dict[Path, str]) -> Iterator[str]:
     for path, text in pages.items():
         if filled(text) != text:
             yield f"{path.relative_to(ROOT)}: tables are out of date, run docs/figures/tables.py"
-    # The README has rows of mini while there is no season.
-    for name in {*TABLES} - {"board mini"} | {SEASON_TABLE if newest() else "board mini"}:
+    for name in {*TABLES} | {SEASON_TABLE}:
         if not any(f"<!-- table: {name} -->\n|" in text for text in pages.values()):
             yield f"no page has the table {name}"
     yield from sentences.problems(pages[path] for path in PAGES)
