@@ -219,7 +219,7 @@ def _season(board: SeasonBoard) -> str:
         table=_csv(board),
         **{name: definition[name] for name in ("train", "calibration", "test")},
     )
-    facts = "\n".join(filter(None, [board.notice, facts]))
+    facts = "\n".join(filter(None, [board.notice, facts.rstrip()]))
     return _board(title, facts, ranks, season.entries, [TEXTS["legend"]], board.drawn())
 
 
@@ -266,7 +266,7 @@ def _board(
 def unranked(ranks: OrderedBoard) -> list[str]:
     """Return why rows of a board have no rank; nothing where none has."""
     rows = [row for row in ranks.standings if row.state and ranks.first]
-    return [f"Not ranked: {row.entry}, {row.state}." for row in rows]
+    return [f"Not ranked: {row.entry} ({row.state})." for row in rows]
 
 
 def first_rows(ranks: OrderedBoard) -> list[str]:

@@ -176,7 +176,7 @@ def ordered(
     states = {e: _state(counted_records[e], compared, metric, seeds, e in variants) for e in order}
     training = {e: _training(by_row[e], _entry_of(e, entries)) for e in order}
     for row, known in training.items():
-        states[row] = ", ".join(filter(None, [states[row], training_mark(known)]))
+        states[row] = ", ".join(filter(None, [training_mark(known), states[row]]))
     places = [e for e in order if ranked and not states[e]]
     terms = {str(e): terms_of(counted_records[e], metric) for e in places}
     above = _tested(terms, places[1:], itertools.pairwise(places))

@@ -56,7 +56,7 @@ def test_a_page_says_who_is_first_when_and_by_whom(season, reported):
     assert "others, 2026" in board
     assert "Benchmarks \\<b\\>" in board
     assert "not done after 5 s" in board
-    assert "Not ranked: broken, timeout in 2 of 8 cells" in board
+    assert "Not ranked: broken (timeout in 2 of 8 cells)" in board
     header = re.search(r"\| rank +\| row +\| whose .*", board)[0]
     assert [cell.strip() for cell in header.split("|")[4:-1]] == [
         "matched AUC", "worst environment", "found within 20", "missed", "false episodes"
@@ -133,7 +133,7 @@ def test_an_oracle_has_the_cells_whose_equations_it_has(tmp_path, season):
     write_row(directory, "oracle", records)
     board = read_season_board(directory)
     (row,) = (row for row in board.ranks.standings if row.training == "oracle")
-    assert row.state == "4 of 8 cells missing, oracle"
+    assert row.state == "oracle, 4 of 8 cells missing"
     text = page(Leaderboard([board]))
     assert re.search(r"\| –.* oracle +\| oracle +\| +\d\d\.\d .*\\\* \|", text)  # noqa: RUF001
     assert "incompatible" not in text
