@@ -92,8 +92,9 @@ def test_whatever_a_worker_says_ends_in_a_known_state(fuzzed):
             os.write(writing, talk)
         os.close(writing)
         settings = {"keep": True, "streamed": bool(len(talk) % 2), "state": None}
+        settings["launcher"] = None
         settings["progress"] = ignore_progress
-        unit = supervisor._UnitRun({}, [], Limits(), lambda: False, None, **settings)
+        unit = supervisor._UnitRun({}, [], None, Limits(), lambda: False, **settings)
         child, outcome = child_of(reading), unit.outcome
         for name in ("send", "send_array", "send_bytes"):
             setattr(child.channel, name, lambda _: None)

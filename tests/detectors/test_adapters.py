@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from oodd_adapters import windows as w
+from oodd_leaderboard.entry import read_entries
 from river import anomaly as river_anomaly
 from river import drift as river_drift
 from river import preprocessing
@@ -471,24 +472,24 @@ def test_adapters_run_beside_other_detectors(tmp_path, tiny_split, capsys):
     assert "sklearn:IsolationForest" in capsys.readouterr().out
 
 
-def test_adapters_are_submitted_and_verified_without_a_look_at_the_class(
-    tmp_path, tiny_split, theirs
-):
+def test_adapters_are_submitted_and_read_without_a_look_at_the_class(tmp_path, tiny_split, theirs):
     command = [
         "run", "--detector", "forecast:their_models.Mean", "--env", "cartpole", "-q",
         "--split", str(tiny_split), "--output", str(tmp_path / "out"), "--jobs", "1",
     ]  # fmt: skip
     assert main(command) == 0
-    submit = ["leaderboard", "submit", str(tmp_path / "out"), "--split", str(tiny_split)]
-    assert main([*submit, "--results", str(tmp_path / "entries")]) == 0
-    # Results are data: verifying them imports nothing that they name.
+    # Results are data: reading them imports nothing that they name.
     theirs.write_text("raise SystemExit('imported')")
     sys.modules.pop("their_models", None)
-    verify = ["leaderboard", "verify", str(tmp_path / "entries"), "--split", str(tiny_split)]
-    assert main(verify) == 0
-    (entry,) = (tmp_path / "entries").iterdir()
-    assert entry.name.startswith("forecast-their_models.mean-tiny")
-    assert not [p for p in entry.rglob("*") if ":" in p.name]
+    submit = ["leaderboard", "submit", str(tmp_path / "out")]
+    submit += ["--detector", "forecast:their_models.Mean"]
+    entries = tmp_path / "board" / "entries"
+    assert main([*submit, "--entries", str(entries)]) == 0
+    (entry,) = read_entries(entries)
+    assert entry.detector == "forecast:their_models.Mean"
+    assert main(["leaderboard", "build", str(tmp_path / "board")]) == 0
+    assert "forecast:their" in (tmp_path / "board" / "README.md").read_text()
+    assert not [p for p in entries.rglob("*") if ":" in p.name]
 
 
 @pytest.mark.parametrize(
