@@ -417,7 +417,7 @@ def test_a_scale_tells_values_beyond_all_nominal_ones_apart():
 
 
 @pytest.mark.slow
-def test_in_the_mean_no_voice_costs_three_points_of_what_the_best_finds(tmp_path):
+def test_no_voice_costs_three_points_of_what_the_best_voice_alone_finds(tmp_path):
     pytest.importorskip("mujoco")
     sizes = {"train": 40, "calibration": 40, "test": 10, "cap": 300, "seed-base": 744}
     options = [f"--{name}={size}" for name, size in sizes.items()]
@@ -451,9 +451,10 @@ def test_in_the_mean_no_voice_costs_three_points_of_what_the_best_finds(tmp_path
         alone = [share(lambda x, voice=voice: x[voice]) for voice in said["twins"][0]]
         joined = share(lambda x: np.max([*x.values()], axis=0))
         losses.append(max(alone) - joined)
-    # A share is of 80 episodes, and its threshold of 40: CartPole alone loses 0.075.
+        # CartPole misses the bound: members and charts cost the ensemble six of 80 episodes.
+        bound = 0.08 if environment == "cartpole" else 0.03
+        assert losses[-1] <= bound, (environment, losses)
     assert np.mean(losses) <= 0.03, losses
-    assert max(losses) <= 0.15, losses
 
 
 # The panel
