@@ -88,7 +88,7 @@ def run(name, root, detectors, results):
     """Run rows on a set, and say what was imported and what of it puts the promise in doubt."""
     started = time.perf_counter()
     recipe = Recipe.load(shipped_recipes()[name])
-    split = import_recipe(recipe, root, results / "splits" / name)
+    split = import_recipe(recipe, root, results / "splits" / name, replace=True)
     print(f"{name}: imported in {time.perf_counter() - started:.1f} s", file=sys.stderr)
     data = split.environment(recipe.environment)
     parts = {"training": data.train, "calibration": data.calibration, "nominal test": data.twins}
