@@ -349,8 +349,8 @@ def write_reference(
     """Write a file of records to compare with later: values, without intervals and costs.
 
     Records stand in the order of the benchmark, whatever the order in which cells ran. Metrics to
-    `keep` are the only ones then, with their terms, from which intervals can be made again; a
-    record need not have all of them. A name that ends in ``.gz`` gets a compressed file.
+    `keep` are the only ones then, with their terms to six digits, from which intervals can be made
+    again; a record need not have all of them. A name that ends in ``.gz`` gets a compressed file.
     """
     records = list(records)
     environments = in_order((r.environment for r in records), ENVIRONMENTS)
@@ -364,7 +364,7 @@ def write_reference(
     for r in sorted(records, key=order):
         kept_metrics = {name: m for name, m in r.metrics.items() if name in keep or not keep}
         metrics = {name: Metric(m.value, n=m.n) for name, m in kept_metrics.items()}
-        terms = {name: r.per_trajectory[name] for name in keep if name in r.per_trajectory}
+        terms = {name: r.per_trajectory[name].round(6) for name in keep if name in r.per_trajectory}
         kept = replace(
             r,
             metrics=metrics,
