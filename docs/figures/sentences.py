@@ -230,7 +230,7 @@ SENTENCES: list[tuple[str, Callable[[], Iterable[Any]]]] = [
      lambda: hidden("oracle", "arcade-a", "panel-a", "mewma-a", "pe-a")[2:]),
     ("It is {} points above `panel-a`, which fits",
      lambda: [apart("worlds", "arcade-a", "panel-a")]),
-    ("Both are above all others, `panel-a` by {} points.",
+    ("Both are above all other detectors, `panel-a` by {} points.",
      lambda: [apart("worlds", "panel-a", "mewma-a")]),
     ("`panel-a` has {} points more there than `panel`, and as many in the drone.",
      lambda: [apart("worlds", "panel-a", "panel", environments=["tank"])]),
