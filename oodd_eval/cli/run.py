@@ -1,6 +1,7 @@
 """``oodd-eval run``: fit and score every selected cell, print tables and write them."""
 
 import json
+import re
 from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
@@ -107,6 +108,11 @@ def run(options: Options) -> int:
     The exit code is 1 when a cell failed, and 2 when the run was interrupted. What was done before
     is kept: the same command goes on.
     """
+    if label := re.search(r"([^,\[]+)\[\w+=[^\]]*\]", options.detector):  # as tables have it
+        raise UsageError(
+            f"--detector has {label[0]!r}, the label of a row: expected the name {label[1]!r}, and "
+            "what is in brackets as --param DETECTOR.NAME=VALUE, --horizon or --seed"
+        )
     split, launcher = load_split(options.split), None
     if options.sandbox:
         launcher = load(SANDBOX)([*split_places(split), str(options.output)])

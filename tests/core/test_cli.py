@@ -309,6 +309,7 @@ def test_options_come_from_a_file_and_the_command_line_wins(run, tmp_path, faili
         ([*CLOCK, "--device", "cpu"], "none of the detectors has a device (clock)"),
         ([*CLOCK, "--device", "tpu"], "'--device'"),
         ([*CLOCK, "-k", "(iid"], "-k '(iid' cannot be read"),
+        ([*CLOCK, "--detector", "clock,rf[h=1,seed=0]"], "'rf[h=1,seed=0]', the label of a row"),
         ([*CLOCK, "-p", "such"], "-p is 'such', expected no:NAME"),
         ([*CLOCK, "--config", "nowhere.toml"], "'nowhere.toml' cannot be read"),
         ([*CLOCK, "--output", "file/out"], "cannot be written to"),

@@ -160,7 +160,7 @@ def test_other_bits_sizes_or_entries_are_refused(whole, entries, tmp_path, capsy
     assert "late" in capsys.readouterr().err
 
 
-def test_a_changed_row_is_run_again_before_a_season_is_whole(whole, entries, tmp_path):
+def test_a_changed_row_is_run_again_before_a_season_is_whole(whole, entries, tmp_path, capsys):
     directory, changed = tmp_path / "season", tmp_path / "entries"
     shutil.copytree(whole, directory)
     shutil.copytree(entries, changed)
@@ -169,6 +169,7 @@ def test_a_changed_row_is_run_again_before_a_season_is_whole(whole, entries, tmp
     (changed / "short.toml").write_text('detector = "mewma"\nparameters = {clip = 4.0}\n')
     (changed / "random.toml").unlink()
     assert season(directory, entries=changed) == 1
+    assert "is whole, with 5 failed results: page" in capsys.readouterr().out
     assert row_path(directory, "mewma").stat().st_mtime_ns == kept
     read = read_season(directory)
     assert {r.overrides["clip"] for r in read.records(directory) if r.detector == "short"} == {4.0}

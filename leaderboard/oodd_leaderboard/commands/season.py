@@ -150,8 +150,10 @@ def _run(runner: running.SeasonRunner, console: Console, *, quiet: bool) -> int:
     with progress_shown("board", quiet=quiet) as show:
         build(read_leaderboard(runner.directory), runner.directory, on_part=show)
     page, site = runner.directory / PAGE, runner.directory / SITE / "index.html"
-    console.print(f"season {runner.season.name} is whole: page {page}, site {site}")
-    return int(not all(record.ok for record in records))
+    failed = sum(not record.ok for record in records)
+    errors = f", with {counted(failed, 'failed result(s)')}" if failed else ""
+    console.print(f"season {runner.season.name} is whole{errors}: page {page}, site {site}")
+    return int(bool(failed))
 
 
 def _outcome(records: Sequence[Record]) -> str:
