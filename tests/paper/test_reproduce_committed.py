@@ -10,7 +10,12 @@ from oodd_eval.cli.main import main
 BOARD = Path(__file__).parents[2] / "leaderboard"
 RESULTS = BOARD / "results"
 COMMITTED = sorted(header.parent for header in BOARD.rglob("reproduction.json"))
-BESIDE = {"mini-paper": "mini", "standard": "mini", "reduced-paper": "standard"}
+BESIDE = {
+    "mini-paper": "mini",
+    "standard": "mini",
+    "reduced": "standard",
+    "reduced-paper": "standard",
+}
 """The reproduction whose numbers stand beside those of another."""
 OWN = "records.jsonl.*"  # where the records are not those of the board
 
